@@ -1,0 +1,424 @@
+"""The digraph of agents and its pinning. Orientation: a_ij > 0 iff agent i hears agent j."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+import scipy.sparse.linalg as spla
+
+from posmas_fmi.errors import NetworkError
+from posmas_fmi.expression import Array
+
+DENSE_LIMIT = 2000  # agents up to which dense O(N³) algorithms are used
+
+
+@attrs.frozen(eq=False)
+class Network:
+    """A digraph with pinning.
+
+    Parameters
+    ----------
+    adjacency : (N, N) sparse array
+        ``a_ij`` ≥ 0; row i lists whom agent i hears, so row sums are in-degrees.
+    pinning : (N,) array_like
+        ``d_i`` ≥ 0, positive for the pinned agents.
+    names : tuple of str, optional
+        Names of the agents, "1" to "N" by default.
+
+    Raises
+    ------
+    NetworkError
+        On wrong shapes, negative or non-finite weights, an arc from an agent to itself.
+
+    Examples
+    --------
+    >>> ring = network_from_arcs(3, [(1, 2), (2, 3), (3, 1)], pinned=[1])
+    >>> ring.pinned_laplacian.toarray()
+    array([[ 2.,  0., -1.],
+           [-1.,  1.,  0.],
+           [ 0., -1.,  1.]])
+    >>> ring.p
+    array([3., 4., 5.])
+    """
+
+    adjacency: sp.csr_array
+    pinning: Array
+    names: tuple[str, ...] = ()
+
+    def __attrs_post_init__(self) -> None:
+        n = self.adjacency.shape[0]
+        pinning = np.array(self.pinning, dtype=float)
+        pinning.flags.writeable = False
+        object.__setattr__(self, "pinning", pinning)
+        adjacency = sp.csr_array(self.adjacency, dtype=float)
+        adjacency.sum_duplicates()
+        adjacency.eliminate_zeros()
+        object.__setattr__(self, "adjacency", adjacency)
+        names = self.names or tuple(str(k + 1) for k in range(n))
+        object.__setattr__(self, "names", names)
+        self._check(n)
+
+    def _check(self, n: int) -> None:
+        if n == 0 or self.adjacency.shape != (n, n):
+            raise NetworkError(
+                f"expected a square adjacency of at least one agent (got {self.adjacency.shape})",
+                "$.network",
+            )
+        weights = self.adjacency.data
+        if not (np.isfinite(weights).all() and (weights > 0).all()):
+            raise NetworkError("expected finite weights > 0 on the arcs", "$.network.arcs")
+        loops = np.flatnonzero(self.adjacency.diagonal())
+        if loops.size:
+            name = self.names[loops[0]]
+            raise NetworkError(f"agent {name} has an arc to itself; leave it out", "$.network.arcs")
+        if self.pinning.shape != (n,) or len(self.names) != n:
+            raise NetworkError(
+                f"expected {n} pinning weights and names "
+                f"(got {self.pinning.shape} and {len(self.names)})",
+                "$.network",
+            )
+        if not (np.isfinite(self.pinning).all() and (self.pinning >= 0).all()):
+            raise NetworkError("expected finite pinning weights >= 0", "$.network.pinned")
+
+    @property
+    def N(self) -> int:
+        """Number of agents."""
+        return int(self.adjacency.shape[0])
+
+    @cached_property
+    def in_degree(self) -> Array:
+        """Row sums of the adjacency, (N,)."""
+        return np.asarray(self.adjacency.sum(axis=1)).ravel()
+
+    @property
+    def pinned(self) -> tuple[int, ...]:
+        """Indices (from 0) of the pinned agents."""
+        return tuple(int(i) for i in np.flatnonzero(self.pinning))
+
+    @cached_property
+    def laplacian(self) -> sp.csr_array:
+        """``L = diag(in-degree) - adjacency``, (N, N)."""
+        return sp.csr_array(sp.diags_array(self.in_degree) - self.adjacency)
+
+    @cached_property
+    def pinned_laplacian(self) -> sp.csr_array:
+        """``L_p = L + D``, (N, N): a non-singular M-matrix iff the leader reaches every agent."""
+        return sp.csr_array(self.laplacian + sp.diags_array(self.pinning))
+
+    def unreached(self) -> tuple[int, ...]:
+        """Return the indices (from 0) of the agents that no message of the leader can reach."""
+        n = self.N
+        # one more node for the leader; csgraph follows i -> j, messages go from heard to hearing
+        heard_by = self.adjacency.T
+        leader = sp.csr_array(self.pinning[None, :])
+        graph = sp.block_array([[heard_by, None], [leader, sp.csr_array((1, 1))]], format="csr")
+        order = csgraph.breadth_first_order(graph, n, return_predecessors=False)
+        missing = np.ones(n + 1, dtype=bool)
+        missing[order] = False
+        return tuple(int(i) for i in np.flatnonzero(missing))
+
+    def require_reached(self) -> None:
+        """Raise NetworkError, with names, unless the leader reaches every agent."""
+        missing = self.unreached()
+        if missing:
+            shown = ", ".join(self.names[i] for i in missing[:10])
+            more = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
+            raise NetworkError(
+                f"no path leads from the leader to agent(s) {shown}{more}; "
+                "pin one of them or add an arc towards them",
+                "$.network",
+            )
+
+    @cached_property
+    def p(self) -> Array:
+        """The vector with ``L_p p = 1``, (N,): positive; large where the leader is far.
+
+        Raises
+        ------
+        NetworkError
+            If an agent cannot be reached from the leader.
+        """
+        self.require_reached()
+        return np.asarray(spla.spsolve(sp.csc_array(self.pinned_laplacian), np.ones(self.N)))
+
+    @property
+    def p_max(self) -> float:
+        """Largest entry of `p`."""
+        return float(self.p.max())
+
+    @cached_property
+    def strongly_connected(self) -> bool:
+        """Whether every agent is reached from every other."""
+        parts, _ = csgraph.connected_components(self.adjacency, directed=True, connection="strong")
+        return bool(parts == 1)
+
+    @cached_property
+    def perron(self) -> Array:
+        """The left null vector f of L with ``f > 0`` and sum 1, (N,) (Definition 2 of the paper).
+
+        Grassmann-Taksar-Heyman elimination up to `DENSE_LIMIT` agents, power iteration beyond;
+        neither subtracts, so small entries keep their relative accuracy.
+
+        Raises
+        ------
+        NetworkError
+            If the digraph is not strongly connected.
+        """
+        if not self.strongly_connected:
+            raise NetworkError(
+                "the left eigenvector f is positive only on a strongly connected digraph; "
+                "use the contraction design, which does not need it",
+                "$.network.arcs",
+            )
+        if self.N <= DENSE_LIMIT:
+            return _gth(self.adjacency.toarray())
+        return _power_iteration(self.adjacency, self.in_degree)
+
+    @cached_property
+    def algebraic_connectivity(self) -> float:
+        """Generalised algebraic connectivity a(L) of (4)."""
+        return generalised_connectivity(self.laplacian, self.perron)
+
+    def with_pinned(self, pinned: Sequence[int], weight: float = 1.0) -> Network:
+        """Return the same digraph with other pinned agents (indices from 0)."""
+        d = np.zeros(self.N)
+        d[list(pinned)] = weight
+        return attrs.evolve(self, pinning=d)
+
+
+def generalised_connectivity(M: Any, f: Array) -> float:
+    """Minimum of ``xᵀ M̂ x / xᵀ Γ x`` over x orthogonal to f, (4) of the paper.
+
+    Parameters
+    ----------
+    M : (N, N) array or sparse array
+        L, or what the paper puts in its place.
+    f : (N,) array
+        Left Perron vector.
+
+    Returns
+    -------
+    float
+    """
+    import scipy.linalg
+
+    dense = M.toarray() if sp.issparse(M) else np.asarray(M)
+    weighted = f[:, None] * dense
+    symmetric = 0.5 * (weighted + weighted.T)
+    basis = scipy.linalg.null_space(f[None, :])
+    numerator, denominator = basis.T @ symmetric @ basis, basis.T @ (f[:, None] * basis)
+    return float(scipy.linalg.eigh(numerator, denominator, eigvals_only=True)[0])
+
+
+def _gth(adjacency: Array) -> Array:
+    """Stationary vector of the Laplacian's transpose by elimination without subtraction."""
+    rates = adjacency.copy()
+    n = len(rates)
+    for k in range(n - 1, 0, -1):
+        rates[:k, k] /= rates[k, :k].sum()
+        rates[:k, :k] += np.outer(rates[:k, k], rates[k, :k])
+    f = np.ones(n)
+    for k in range(1, n):
+        f[k] = f[:k] @ rates[:k, k]
+    return np.asarray(f / f.sum())
+
+
+def _power_iteration(adjacency: sp.csr_array, in_degree: Array) -> Array:
+    speed = 1.01 * in_degree.max()
+    step = sp.csr_array((adjacency.T + sp.diags_array(speed - in_degree)) / speed)
+    f = np.full(len(in_degree), 1.0 / len(in_degree))
+    for _ in range(1_000_000):
+        following = step @ f
+        following /= following.sum()
+        if np.abs(following - f).max() <= 1e-15 * following.max():
+            return np.asarray(following)
+        f = following
+    raise NetworkError("the power iteration for f did not settle", "$.network.arcs")
+
+
+def network_from_arcs(
+    agents: int,
+    arcs: Sequence[Sequence[float]],
+    pinned: Sequence[int] | Mapping[int, float] = (),
+    names: Sequence[str] = (),
+) -> Network:
+    """Build a network from arcs between agents numbered from 1.
+
+    Parameters
+    ----------
+    agents : int
+        N.
+    arcs : sequence of (from, to) or (from, to, weight)
+        "from" is heard by "to".
+    pinned : sequence of int, or mapping of int to float
+        Numbers of the pinned agents, or their weights.
+    names : sequence of str, optional
+
+    Returns
+    -------
+    Network
+
+    Raises
+    ------
+    NetworkError
+        Naming the arc or the pin that is wrong.
+
+    Examples
+    --------
+    >>> network_from_arcs(2, [(1, 3)])
+    Traceback (most recent call last):
+        ...
+    posmas_fmi.errors.NetworkError: $.network.arcs[0]: expected agents from 1 to 2 (got 3)
+    """
+    if agents < 1:
+        raise NetworkError(f"expected at least one agent (got {agents})", "$.network.agents")
+    table = np.ones((len(arcs), 3))
+    for k, arc in enumerate(arcs):
+        if len(arc) not in (2, 3):
+            raise NetworkError(
+                f"expected [from, to] or [from, to, weight] (got {list(arc)})",
+                f"$.network.arcs[{k}]",
+            )
+        table[k, : len(arc)] = arc
+    _check_arcs(table, agents)
+    d = np.zeros(agents)
+    weights = pinned if isinstance(pinned, Mapping) else dict.fromkeys(pinned, 1.0)
+    for k, (agent, weight) in enumerate(weights.items()):
+        if not 1 <= agent <= agents:
+            raise NetworkError(
+                f"expected agents from 1 to {agents} (got {agent})", f"$.network.pinned[{k}]"
+            )
+        d[agent - 1] = weight
+    row, column = table[:, 1].astype(int) - 1, table[:, 0].astype(int) - 1
+    adjacency = sp.csr_array((table[:, 2], (row, column)), shape=(agents, agents))
+    return Network(adjacency, d, tuple(names))
+
+
+def _check_arcs(table: Array, agents: int) -> None:
+    ends = table[:, :2]
+    bad = np.argwhere(~((ends >= 1) & (ends <= agents) & (ends == np.floor(ends))))
+    if bad.size:
+        k, end = bad[0]
+        raise NetworkError(
+            f"expected agents from 1 to {agents} (got {ends[k, end]:g})", f"$.network.arcs[{k}]"
+        )
+    loops = np.flatnonzero(ends[:, 0] == ends[:, 1])
+    if loops.size:
+        raise NetworkError(
+            f"agent {ends[loops[0], 0]:g} has an arc to itself; leave it out",
+            f"$.network.arcs[{loops[0]}]",
+        )
+    keys = ends[:, 0] * (agents + 1) + ends[:, 1]
+    _, first = np.unique(keys, return_index=True)
+    if len(first) < len(keys):
+        repeated = sorted(set(range(len(keys))) - set(first.tolist()))[0]
+        a, b = ends[repeated]
+        raise NetworkError(
+            f"the arc from {a:g} to {b:g} is there twice; give one with a weight",
+            f"$.network.arcs[{repeated}]",
+        )
+
+
+def read_adjacency(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
+    """Read a digraph from ``.csv`` (header ``from,to[,weight]``), ``.mtx`` or ``.graphml``.
+
+    Parameters
+    ----------
+    path : Path
+        In Matrix Market files row i lists whom agent i hears.
+
+    Returns
+    -------
+    adjacency : (N, N) sparse array
+    names : tuple of str
+        Node names, in the order of the rows.
+
+    Raises
+    ------
+    NetworkError
+        If the file cannot be read as a digraph.
+    """
+    readers = {".csv": _read_csv, ".mtx": _read_matrix_market, ".graphml": _read_graphml}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise NetworkError(
+            f"expected a .csv, .mtx or .graphml file (got {path.name})", "$.network.file"
+        )
+    try:
+        return reader(path)
+    except NetworkError:
+        raise
+    except Exception as error:  # whatever a foreign parser raises on a broken file
+        raise NetworkError(f"cannot read {path.name}: {error}", "$.network.file") from error
+
+
+def _read_csv(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.reader(stream))
+    header = [cell.strip().lower() for cell in rows[0]] if rows else []
+    if header not in (["from", "to"], ["from", "to", "weight"]):
+        raise NetworkError(
+            f"{path.name}, line 1: expected the header from,to or from,to,weight (got {header})",
+            "$.network.file",
+        )
+    arcs: list[tuple[str, str, float]] = []
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise NetworkError(
+                f"{path.name}, line {number}: expected {len(header)} columns (got {len(row)})",
+                "$.network.file",
+            )
+        arcs.append((row[0].strip(), row[1].strip(), float(row[2]) if len(row) == 3 else 1.0))
+    return _from_named_arcs(arcs)
+
+
+def _from_named_arcs(
+    arcs: Sequence[tuple[str, str, float]],
+) -> tuple[sp.csr_array, tuple[str, ...]]:
+    found = dict.fromkeys(end for a, b, _ in arcs for end in (a, b))
+    numeric = all(name.isdecimal() for name in found)
+    # numbers are agent numbers from 1: agents without an arc in between exist as well
+    names = (
+        tuple(str(k + 1) for k in range(max((int(n) for n in found), default=0)))
+        if numeric
+        else tuple(found)
+    )
+    index = {name: k for k, name in enumerate(names)}
+    if not arcs:
+        raise NetworkError("the file has no arcs", "$.network.file")
+    if numeric and "0" in found:
+        raise NetworkError("agents are numbered from 1 (got 0)", "$.network.file")
+    row, column = [index[b] for _, b, _ in arcs], [index[a] for a, _, _ in arcs]
+    weights = [w for _, _, w in arcs]
+    return sp.csr_array((weights, (row, column)), shape=(len(names), len(names))), names
+
+
+def _read_matrix_market(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
+    import scipy.io
+
+    matrix = sp.csr_array(scipy.io.mmread(path))
+    return matrix, tuple(str(k + 1) for k in range(matrix.shape[0]))
+
+
+def _read_graphml(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
+    import networkx
+
+    graph = networkx.read_graphml(path)
+    nodes = list(graph.nodes)
+    arcs = [(str(a), str(b), float(w)) for a, b, w in graph.edges(data="weight", default=1.0)]
+    if not graph.is_directed():
+        arcs += [(b, a, w) for a, b, w in arcs]
+    index = {str(name): k for k, name in enumerate(nodes)}
+    row, column = [index[b] for _, b, _ in arcs], [index[a] for a, _, _ in arcs]
+    matrix = sp.csr_array(([w for *_, w in arcs], (row, column)), shape=(len(nodes), len(nodes)))
+    return matrix, tuple(str(n) for n in nodes)
