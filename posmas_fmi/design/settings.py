@@ -1,0 +1,142 @@
+"""What a user may ask of a design."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import attrs
+import numpy as np
+
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array
+
+Method = Literal["contraction", "lmi", "paper-1", "paper-2", "gains"]
+METHODS: tuple[Method, ...] = ("contraction", "lmi", "paper-1", "paper-2", "gains")
+
+
+def _optional_matrix(value: Any) -> Array | None:
+    if value is None:
+        return None
+    try:
+        array = np.atleast_2d(np.array(value, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"expected a matrix of numbers (got {value!r})", "$.design") from None
+    array.flags.writeable = False
+    return array
+
+
+def _one_of(*allowed: str) -> Any:
+    def check(_: object, attribute: Any, value: object) -> None:
+        if value not in allowed:
+            raise InputError(
+                f"expected one of {', '.join(allowed)} (got {value!r})",
+                f"$.design.{attribute.name}",
+            )
+
+    return check
+
+
+def _positive(_: object, attribute: Any, value: object) -> None:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (number and 0.0 < float(value) < math.inf):  # type: ignore[arg-type]
+        raise InputError(
+            f"expected a finite number > 0 (got {value!r})", f"$.design.{attribute.name}"
+        )
+
+
+@attrs.frozen(eq=False)
+class DesignSettings:
+    """Choices of a design; the defaults give the fastest certified contraction.
+
+    Parameters
+    ----------
+    method : {"contraction", "lmi", "paper-1", "paper-2", "gains"}
+        How gains are found; ``"gains"`` takes `K` and `E` as given.
+    observer : {"local", "distributed"}
+        Each agent from its own output, or from neighbours' output errors (25).
+    phi, mu : float
+        Coupling of controller and of the distributed observer.
+    K, E : matrices, optional
+        Gains (p, m) and (m, q), for ``"gains"``.
+    objective : {"rate", "gain", "band"}
+        Fastest certified rate; least gains for the wanted `rate`; smallest guaranteed band.
+    rate, observer_rate : float, optional
+        Wanted rates [1/s]. An observer rate that is not given is ten times the tracking rate.
+    weights : {"p", "perron"}
+        Agents' weights in the norm: ``L_p p = 1``, or the Perron vector of L_p (never slower).
+    disturbance : sequence of float, optional
+        Bound on an additive disturbance of each state's derivative, for the band.
+    saturation : float, optional
+        Limit of ``|u|``, for the certified region of attraction.
+    eta, delta : float
+        Constants of Algorithms 1 and 2.
+    form : {"corrected", "printed"}
+        Form of Algorithms 1 and 2.
+    protocol : {"corrected", "printed"}
+        Signs in the running controller: L + D, or as printed (errata 1 and 2).
+    digits : int
+        Significant digits with which gains ship; the rounded gains are the certified ones.
+
+    Raises
+    ------
+    InputError
+        Naming the key.
+
+    Examples
+    --------
+    >>> DesignSettings(phi=10.0).method
+    'contraction'
+    >>> DesignSettings(phi=-1.0)
+    Traceback (most recent call last):
+        ...
+    posmas_fmi.errors.InputError: $.design.phi: expected a finite number > 0 (got -1.0)
+    """
+
+    method: Method = attrs.field(default="contraction", validator=_one_of(*METHODS))
+    observer: Literal["local", "distributed"] = attrs.field(
+        default="local", validator=_one_of("local", "distributed")
+    )
+    phi: float = attrs.field(default=1.0, validator=_positive)
+    mu: float = attrs.field(default=1.0, validator=_positive)
+    K: Array | None = attrs.field(default=None, converter=_optional_matrix)
+    E: Array | None = attrs.field(default=None, converter=_optional_matrix)
+    objective: Literal["rate", "gain", "band"] = attrs.field(
+        default="rate", validator=_one_of("rate", "gain", "band")
+    )
+    rate: float | None = attrs.field(default=None, validator=_positive)
+    observer_rate: float | None = attrs.field(default=None, validator=_positive)
+    weights: Literal["p", "perron"] = attrs.field(default="p", validator=_one_of("p", "perron"))
+    disturbance: tuple[float, ...] | None = attrs.field(
+        default=None, converter=attrs.converters.optional(tuple)
+    )
+    saturation: float | None = attrs.field(default=None, validator=_positive)
+    eta: float = attrs.field(default=0.6, validator=_positive)
+    delta: float = attrs.field(default=0.02, validator=_positive)
+    form: Literal["corrected", "printed"] = attrs.field(
+        default="corrected", validator=_one_of("corrected", "printed")
+    )
+    protocol: Literal["corrected", "printed"] = attrs.field(
+        default="corrected", validator=_one_of("corrected", "printed")
+    )
+    digits: int = 6
+
+    def __attrs_post_init__(self) -> None:
+        if self.method == "gains" and (self.K is None or self.E is None):
+            missing = "K" if self.K is None else "E"
+            raise InputError(
+                f'method = "gains" needs both K and E (no {missing} given)', f"$.design.{missing}"
+            )
+        if self.objective == "gain" and self.rate is None:
+            raise InputError('objective = "gain" needs the wanted rate', "$.design.rate")
+        for name in ("K", "E"):
+            value: Array | None = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise InputError("expected finite numbers", f"$.design.{name}")
+        for value in self.disturbance or ():
+            if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+                raise InputError(
+                    f"expected finite bounds >= 0 (got {value!r})", "$.design.disturbance"
+                )
+        if not 2 <= self.digits <= 15:
+            raise InputError(f"expected 2 to 15 (got {self.digits})", "$.design.digits")
