@@ -327,7 +327,8 @@ class Agent:
         import control
 
         def update(t: float, x: Array, u: Array, params: object) -> Array:
-            return self.derivative(t, np.reshape(x, (1, -1)), np.reshape(u, (1, -1)))[0]
+            rows = self.derivative(t, np.reshape(x, (1, -1)), np.reshape(u, (1, -1)))
+            return np.asarray(rows[0])
 
         def output(t: float, x: Array, u: Array, params: object) -> Array:
             return np.asarray(self.C @ x)

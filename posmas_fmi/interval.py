@@ -362,7 +362,7 @@ def bounds(
 
 
 def _inner_point(low: Array, high: Array) -> Array:
-    """Return a finite point of each box: the middle, or near the finite end of an unbounded side."""
+    """Return a finite point of each box: the middle, or near the end of an unbounded side."""
     with np.errstate(invalid="ignore"):
         middle = 0.5 * (low + high)
     one_sided = np.where(np.isfinite(low), low + 1.0, np.where(np.isfinite(high), high - 1.0, 0.5))

@@ -1,0 +1,91 @@
+"""Sampled propagation of x' = A x + H g(t, x) + w with w held: the observer's and leader's step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import attrs
+import numpy as np
+import scipy.linalg
+
+from posmas_fmi.agent import Agent
+from posmas_fmi.expression import Array
+
+
+@attrs.frozen(eq=False)
+class Propagator:
+    """One communication step of ``x' = A x + H g(t, x) + w`` for many agents at once.
+
+    The linear part and the held input are exact (matrix exponential); g is integrated by the
+    exponential Runge-Kutta method ETDRK4 of Cox and Matthews (J. Comput. Phys. 176, 2002), fourth
+    order in h and exact where g is constant. So the observer follows the same flow as the plant,
+    as certificate T assumes, up to an error of order h⁵ per step.
+
+    Parameters
+    ----------
+    agent : Agent
+    h : float
+        Communication step [s].
+
+    Examples
+    --------
+    >>> from posmas_fmi.agent import linear_agent
+    >>> step = Propagator.of(linear_agent([[-1.0]], [[1.0]], [[1.0]]), h=0.5)
+    >>> step(0.0, np.array([[1.0]]), np.array([[2.0]])).round(6)  # 2 - exp(-0.5)
+    array([[1.393469]])
+    """
+
+    h: float
+    H: Array
+    g: Callable[[float, Array], Array]
+    full: Array  # e^{Ah}
+    half: Array  # e^{Ah/2}
+    gamma: Array  # ∫₀ʰ e^{Aτ} dτ
+    half_gamma: Array
+    start: Array  # ETDRK4 weights of g at the start, the two middles and the end
+    middle: Array
+    end: Array
+
+    @classmethod
+    def of(cls, agent: Agent, h: float) -> Propagator:
+        """Precompute the matrices for one agent model and step."""
+        phi0, phi1, phi2, phi3 = _phi_functions(agent.A * h)
+        half0, half1, _, _ = _phi_functions(agent.A * (0.5 * h))
+        return cls(
+            h=h,
+            H=agent.H,
+            g=agent.g_numpy,
+            full=phi0,
+            half=half0,
+            gamma=h * phi1,
+            half_gamma=0.5 * h * half1,
+            start=h * (phi1 - 3.0 * phi2 + 4.0 * phi3),
+            middle=h * (2.0 * phi2 - 4.0 * phi3),
+            end=h * (4.0 * phi3 - phi2),
+        )
+
+    def __call__(self, t: float, X: Array, W: Array) -> Array:
+        """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""
+        h, H = self.h, self.H
+        ga = self.g(t, X) @ H.T
+        base = X @ self.half.T + W @ self.half_gamma.T
+        a = base + ga @ self.half_gamma.T
+        gb = self.g(t + 0.5 * h, a) @ H.T
+        b = base + gb @ self.half_gamma.T
+        gc = self.g(t + 0.5 * h, b) @ H.T
+        c = a @ self.half.T + (2.0 * gc - ga + W) @ self.half_gamma.T
+        gd = self.g(t + h, c) @ H.T
+        linear = X @ self.full.T + W @ self.gamma.T
+        return np.asarray(linear + ga @ self.start.T + (gb + gc) @ self.middle.T + gd @ self.end.T)
+
+
+def _phi_functions(M: Array) -> tuple[Array, Array, Array, Array]:
+    """φ₀…φ₃ of a matrix, φ₀ = e^M, φ_k = (φ_{k-1} - I/(k-1)!) / M, without the division."""
+    m = len(M)
+    augmented = np.zeros((4 * m, 4 * m))
+    augmented[:m, :m] = M
+    for k in range(3):  # e^[[M, I, 0], [0, 0, I], …] holds the φ functions in its first row
+        augmented[k * m : (k + 1) * m, (k + 1) * m : (k + 2) * m] = np.eye(m)
+    first_row = scipy.linalg.expm(augmented)[:m]
+    phi0, phi1, phi2, phi3 = (first_row[:, k * m : (k + 1) * m] for k in range(4))
+    return phi0, phi1, phi2, phi3

@@ -1,0 +1,157 @@
+"""Results as NetCDF-4, written in chunks while the run goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.expression import Array
+from posmas_fmi.network import Network
+
+CHUNK = 512  # rows held in memory before they are written
+
+
+@attrs.frozen
+class Layout:
+    """What the columns of a result are: sizes, names and units."""
+
+    agents: tuple[str, ...]
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def shape(self, variable: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Dimensions and sizes of one row of a variable."""
+        n, m = len(self.agents), len(self.states)
+        p, q = len(self.inputs), len(self.outputs)
+        return {
+            "x": (("agent", "state"), (n, m)),
+            "x_baseline": (("agent", "state"), (n, m)),
+            "xhat": (("agent", "state"), (n, m)),
+            "u": (("agent", "input"), (n, p)),
+            "sec_u": (("agent", "input"), (n, p)),
+            "y": (("agent", "output"), (n, q)),
+            "s": (("state",), (m,)),
+        }[variable]
+
+
+class Recorder:
+    """Write rows of named arrays to one NetCDF-4 file.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced if it exists.
+    layout : Layout
+    network : Network
+        Stored with the results, so that a report needs nothing else.
+    variables : tuple of str
+        Of `Layout.shape`; ``time`` comes by itself.
+    attributes : dict
+        Global attributes of the file. ``complete`` is 0 until `finish`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        layout: Layout,
+        network: Network,
+        variables: tuple[str, ...],
+        attributes: dict[str, Any],
+    ) -> None:
+        import h5netcdf
+
+        self._layout = layout
+        self._rows: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
+        self._written = 0
+        self._file = h5netcdf.File(path, "w")
+        self._define(network, variables, attributes)
+
+    def _define(
+        self, network: Network, variables: tuple[str, ...], attributes: dict[str, Any]
+    ) -> None:
+        file, layout = self._file, self._layout
+        file.dimensions = {
+            "time": None,
+            "agent": len(layout.agents),
+            "state": len(layout.states),
+            "input": len(layout.inputs),
+            "output": len(layout.outputs),
+            "arc": network.adjacency.nnz,
+        }
+        for name in ("agent", "state", "input", "output"):
+            labels = np.array(getattr(layout, f"{name}s"), dtype=object)
+            file.create_variable(name, (name,), _text(), data=labels)
+        receiver = np.repeat(np.arange(network.N), np.diff(network.adjacency.indptr))
+        for name, data in (
+            ("arc_from", network.adjacency.indices.astype(np.int64)),
+            ("arc_to", receiver.astype(np.int64)),
+            ("arc_weight", network.adjacency.data),
+        ):
+            file.create_variable(name, ("arc",), data.dtype, data=data)
+        file.create_variable("pinning", ("agent",), float, data=network.pinning)
+        time = file.create_variable("time", ("time",), float, chunks=(CHUNK,))
+        time.attrs["units"] = "s"
+        for name in variables:
+            dimensions, sizes = layout.shape(name)
+            file.create_variable(name, ("time", *dimensions), float, chunks=_chunks(sizes))
+        file.attrs.update({**attributes, "complete": 0})
+        file.flush()
+
+    def record(self, time: float, values: dict[str, Array]) -> None:
+        """Add one row; the arrays are copied."""
+        self._rows["time"].append(np.asarray(time))
+        for name, value in values.items():
+            self._rows[name].append(np.array(value, dtype=float))
+        if len(self._rows["time"]) >= CHUNK:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what is held in memory."""
+        count = len(self._rows["time"])
+        if not count:
+            return
+        first, last = self._written, self._written + count
+        self._file.resize_dimension("time", last)
+        for name, rows in self._rows.items():
+            self._file.variables[name][first:last] = np.stack(rows)
+            rows.clear()
+        self._written = last
+        self._file.flush()
+
+    def finish(self) -> None:
+        """Write the rest and mark the result as complete."""
+        self.flush()
+        self._file.attrs["complete"] = 1
+
+    def close(self) -> None:
+        """Write the rest and close the file; `complete` stays as it is."""
+        self.flush()
+        self._file.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _text() -> Any:
+    import h5py
+
+    return h5py.string_dtype("utf-8")
+
+
+def _chunks(sizes: tuple[int, ...]) -> tuple[int, ...]:
+    """About one megabyte per chunk, at least one row, at most `CHUNK` rows."""
+    row = 8 * int(np.prod(sizes))
+    return (max(1, min(CHUNK, 1_000_000 // max(1, row))), *sizes)
