@@ -1,0 +1,1 @@
+"""FMUs: their models, description, C sources and build; loading and calling them."""

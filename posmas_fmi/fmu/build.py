@@ -1,0 +1,235 @@
+"""From a model to a .fmu file: found among the prebuilt ones, in the cache, or built now."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import logging
+import os
+import sys
+import tempfile
+import tomllib
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from posmas_fmi import resources
+from posmas_fmi.errors import BuildError
+from posmas_fmi.expression import VectorFunction
+from posmas_fmi.fmu.compile import FLAGS, PLATFORMS, Platform, host, shared_library
+from posmas_fmi.fmu.description import build_description, model_description
+from posmas_fmi.fmu.model import FmuModel
+from posmas_fmi.fmu.positive_agent import positive_agent
+from posmas_fmi.fmu.sources import FmiVersion, compiled, instantiation_token, sources
+
+_LOG = logging.getLogger(__name__)
+
+
+def agent_fmu(
+    g: VectorFunction,
+    sec: VectorFunction,
+    m: int,
+    p: int,
+    q: int,
+    fmi: int = 3,
+    platforms: Sequence[str] | None = None,
+    cache: Path | None = None,
+) -> Path:
+    """Return the .fmu of model (1) with these nonlinearities; A, H, B, C are its parameters.
+
+    Parameters
+    ----------
+    g, sec : VectorFunction
+        See `posmas_fmi.fmu.positive_agent.positive_agent`.
+    m, p, q : int
+        Numbers of states, inputs, outputs.
+    fmi : {2, 3}
+    platforms : sequence of str, optional
+        Names from `posmas_fmi.fmu.compile.PLATFORMS`; default the host.
+    cache : Path, optional
+        Folder to keep built FMUs in; default the user's cache.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    BuildError
+        If it has to be built and cannot be.
+    """
+    return fmu(positive_agent(g, sec, m, p, q), fmi, platforms, cache)
+
+
+def fmu(
+    model: FmuModel,
+    fmi: int = 3,
+    platforms: Sequence[str] | None = None,
+    cache: Path | None = None,
+) -> Path:
+    """Return the .fmu of a model: prebuilt, cached, or built now; parameters as `agent_fmu`."""
+    version, wanted = _version(fmi), _platforms(platforms, fmi)
+    name = file_name(model, version, wanted)
+    folder = cache if cache is not None else cache_folder()
+    for place in (resources.prebuilt() / name, folder / name):
+        if place.is_file():
+            return place
+    path = folder / name
+    write(path, archive(model, version, wanted))
+    return path
+
+
+def file_name(model: FmuModel, fmi: FmiVersion, platforms: Sequence[Platform]) -> str:
+    """Name of the archive: the model, the FMI version and a hash of all that goes into it."""
+    content = (instantiation_token(model, fmi), *(p.name for p in platforms), *FLAGS)
+    key = hashlib.sha256("\n".join(content).encode()).hexdigest()[:16]
+    return f"{model.name}-fmi{fmi}-{key}.fmu"
+
+
+def archive(model: FmuModel, fmi: FmiVersion, platforms: Sequence[Platform]) -> bytes:
+    """Build the archive: description, binaries, sources. The same arguments give the same bytes."""
+    files = sources(model, fmi)
+    units = compiled(files)
+    content: dict[str, bytes] = {"modelDescription.xml": model_description(model, fmi, units)}
+    content |= {f"sources/{name}": text.encode() for name, text in files.items()}
+    if fmi == 3:
+        content["sources/buildDescription.xml"] = build_description(model, units)
+    for target in platforms:
+        place = f"binaries/{target.folder(fmi)}/{model.name}{target.extension}"
+        content[place] = shared_library(files, units, model.name, target)
+    return _zip(content)
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write a file so that other processes see all of it or nothing.
+
+    Raises
+    ------
+    BuildError
+        If the folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise BuildError(f"cannot write the FMU: {error}", str(path)) from error
+
+
+def cache_folder() -> Path:
+    """Return the user's cache folder of this package, by the custom of the system."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+    return base / "posmas-fmi" / "fmu"
+
+
+# ---- what ships ---------------------------------------------------------------------------------
+
+
+def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
+    """Build the agents of all scenarios in a folder, FMI 2 and 3, for this machine.
+
+    Parameters
+    ----------
+    models_dir : Path
+        Folder of ``*.toml`` with an ``[agent]`` section each.
+    out_dir : Path
+        Where the .fmu files go, by the names that `agent_fmu` looks for.
+
+    Returns
+    -------
+    list of Path
+        Each distinct FMU once.
+
+    Raises
+    ------
+    BuildError
+        If a scenario cannot be read or compiled.
+    """
+    paths: list[Path] = []
+    for file in sorted(models_dir.glob("*.toml")):
+        try:
+            agent = tomllib.loads(file.read_text(encoding="utf-8")).get("agent")
+        except (OSError, ValueError) as error:
+            raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
+        if not isinstance(agent, dict):
+            continue  # a scenario of plants that bring their own FMU
+        model = positive_agent(*_functions_of(agent, str(file)))
+        for fmi in (2, 3):
+            version = _version(fmi)
+            path = out_dir / file_name(model, version, (host(),))
+            if path in paths:
+                continue
+            if not path.is_file():
+                write(path, archive(model, version, (host(),)))
+            paths.append(path)
+    return paths
+
+
+def _functions_of(
+    agent: Mapping[str, Any], where: str
+) -> tuple[VectorFunction, VectorFunction, int, int, int]:
+    try:
+        m, p, q = len(agent["A"]), len(agent["B"][0]), len(agent["C"])
+        x = [f"x{k + 1}" for k in range(m)]
+        u = [f"u{k + 1}" for k in range(p)]
+        g, sec = agent["g"], agent["sec"]
+    except (KeyError, TypeError, IndexError) as error:
+        raise BuildError(f"expected A, B, C, g, sec in [agent] ({error!r})", where) from error
+    place = f"{where}: $.agent"
+    return (
+        VectorFunction.parse(g, ["t", *x], f"{place}.g"),
+        VectorFunction.parse(sec, u, f"{place}.sec"),
+        m,
+        p,
+        q,
+    )
+
+
+# ---- details ------------------------------------------------------------------------------------
+
+
+def _version(fmi: int) -> FmiVersion:
+    if fmi == 2:
+        return 2
+    if fmi == 3:
+        return 3
+    raise BuildError(f"expected FMI version 2 or 3 (got {fmi!r})")
+
+
+def _platforms(names: Sequence[str] | None, fmi: int) -> tuple[Platform, ...]:
+    if names is None:
+        return (host(),)
+    unknown = sorted(set(names) - set(PLATFORMS))
+    if unknown or not names:
+        raise BuildError(f"expected platforms from {', '.join(PLATFORMS)} (got {list(names)})")
+    chosen = tuple(PLATFORMS[name] for name in PLATFORMS if name in names)
+    folders = [p.folder(fmi) for p in chosen]
+    if len(set(folders)) < len(folders):
+        raise BuildError(f"FMI {fmi} has one folder only for two of {', '.join(names)}; take one")
+    return chosen
+
+
+def _zip(content: Mapping[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
+        for name in sorted(content):
+            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3
+            entry.external_attr = 0o100644 << 16
+            file.writestr(entry, content[name])
+    return buffer.getvalue()
