@@ -3,5 +3,7 @@
 from __future__ import annotations
 
 from posmas_fmi.certify.certificate import Certificate, Condition, Region
+from posmas_fmi.certify.closed_loop import baseline, certify_loop
+from posmas_fmi.certify.loop import Loop
 
-__all__ = ["Certificate", "Condition", "Region"]
+__all__ = ["Certificate", "Condition", "Loop", "Region", "baseline", "certify_loop"]

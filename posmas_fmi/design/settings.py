@@ -63,8 +63,9 @@ class DesignSettings:
         Fastest certified rate; least gains for the wanted `rate`; smallest guaranteed band.
     rate, observer_rate : float, optional
         Wanted rates [1/s]. An observer rate that is not given is ten times the tracking rate.
-    weights : {"p", "perron"}
-        Agents' weights in the norm: ``L_p p = 1``, or the Perron vector of L_p (never slower).
+    weights : {"auto", "p", "perron"}
+        Agents' weights in the norm: p of ``L_p p = 1`` (one solve), the Perron vector of L_p (a
+        rate that is never lower), or p and, where p proves no rate, the Perron vector.
     disturbance : sequence of float, optional
         Bound on an additive disturbance of each state's derivative, for the band.
     saturation : float, optional
@@ -106,7 +107,9 @@ class DesignSettings:
     )
     rate: float | None = attrs.field(default=None, validator=_positive)
     observer_rate: float | None = attrs.field(default=None, validator=_positive)
-    weights: Literal["p", "perron"] = attrs.field(default="p", validator=_one_of("p", "perron"))
+    weights: Literal["auto", "p", "perron"] = attrs.field(
+        default="auto", validator=_one_of("auto", "p", "perron")
+    )
     disturbance: tuple[float, ...] | None = attrs.field(
         default=None, converter=attrs.converters.optional(tuple)
     )

@@ -1,0 +1,50 @@
+"""What a certificate takes from outside: bounds of the agent, and where they are known to hold."""
+
+from __future__ import annotations
+
+import math
+
+import attrs
+import numpy as np
+
+from posmas_fmi.agent import Agent, Assumption
+from posmas_fmi.certify.loop import Loop
+
+
+def assumptions(loop: Loop) -> tuple[Assumption, ...]:
+    """Collect every assumption of a certificate for that loop."""
+    found = list(loop.agent.assumptions())
+    region = _region(loop.agent, found)
+    if region is not None:
+        found.append(region)
+    if loop.observer == "distributed" and loop.network.adjacency.nnz:
+        found.append(
+            Assumption(
+                "innovation",
+                "declared",
+                "estimates stay non-negative while EC sum_j (Lp)_ij e_j >= 0, e = x - xhat: an "
+                "agent next to a neighbour with a larger error can undershoot; the local "
+                "observer does not need this",
+            )
+        )
+    return tuple(found)
+
+
+def _region(agent: Agent, found: list[Assumption]) -> Assumption | None:
+    """Whether the bounds on g hold everywhere or only on a region that states might leave."""
+    limited = any(agent.box()[name] != (0.0, math.inf) for name in agent.box())
+    lipschitz = next(a for a in found if a.name == "lipschitz")
+    if not limited or agent.slopes is None or lipschitz.status == "contradicted":
+        return None
+    inputs = {name: r for name, r in agent.region.items() if name.startswith("u")}
+    anywhere = attrs.evolve(agent, region=inputs)
+    if (anywhere.lipschitz_bound <= agent.ell * (1 + 1e-12)).all() and (
+        np.isfinite(anywhere.growth).all() or not np.isfinite(agent.growth).all()
+    ):
+        return Assumption("region", "verified", "the bounds on g hold for every x >= 0, t >= 0")
+    where = ", ".join(f"{n} in [{a:g}, {b:g}]" for n, (a, b) in agent.box().items())
+    return Assumption(
+        "region",
+        "declared",
+        f"the bounds on g hold for {where}; that states stay there is not proved",
+    )

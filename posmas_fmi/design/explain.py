@@ -1,0 +1,90 @@
+"""Why no gain works: which of positivity and contraction clash, where, and what would help."""
+
+from __future__ import annotations
+
+import attrs
+
+from posmas_fmi.certify import Loop
+from posmas_fmi.certify.loop import Feedback
+from posmas_fmi.design.program import Problem, Solution, alternate
+from posmas_fmi.design.settings import DesignSettings
+from posmas_fmi.errors import DesignError
+
+_PINS_TRIED = 200
+_SHORTER = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+
+
+def clash(
+    loop: Loop,
+    feedback: Feedback,
+    problem: Problem,
+    found: Solution | None,
+    settings: DesignSettings,
+) -> DesignError:
+    """Explain a failed design of one feedback."""
+    controller = feedback.name == "controller"
+    wanted = (settings.rate if controller else settings.observer_rate) or 0.0
+    letter = "K" if controller else "E"
+    best = (
+        "no gain is positive"
+        if found is None
+        else f"the largest {letter} that is positive gives the rate {found.rate:.4g} 1/s"
+    )
+    text = (
+        f"positivity and contraction of the {feedback.name} clash: {best} (wanted > {wanted:g}). "
+        f"Positivity limits {letter} at {feedback.strongest}, contraction is short at "
+        f"{feedback.weakest}"
+    )
+    tolerant = alternate(problem, "tolerant", max(wanted, 1e-9))
+    if tolerant is not None:
+        text += (
+            f"; contraction would need the sign conditions to give way by {tolerant.excess:.4g} 1/s"
+        )
+    else:
+        text += "; no gain contracts even without positivity"
+    helps = _period(problem, wanted) + (_pins(loop, problem, wanted) if controller else [])
+    advice = "; ".join(helps) if helps else "no single change of pin or period was found to help"
+    return DesignError(f"{text}. What helps: {advice}", "$.design")
+
+
+def _works(problem: Problem, wanted: float) -> float | None:
+    found = alternate(problem, "fast")
+    return found.rate if found is not None and found.rate > wanted else None
+
+
+def _period(problem: Problem, wanted: float) -> list[str]:
+    if problem.period is None:
+        return []
+    for factor in _SHORTER:
+        h = factor * problem.period
+        rate = _works(attrs.evolve(problem, period=h), wanted)
+        if rate is not None:
+            return [f"a period of {h:.3g} s instead of {problem.period:.3g} s gives {rate:.3g} 1/s"]
+    return []
+
+
+def _pins(loop: Loop, problem: Problem, wanted: float) -> list[str]:
+    """Another pinned agent, else one more."""
+    network = loop.network
+    if network.N > _PINS_TRIED:
+        return []
+    now = network.pinned
+    weight = float(network.pinning.max())
+    one = [tuple([i]) for i in range(network.N) if len(now) == 1 and i not in now]
+    more = [(*now, i) for i in range(network.N) if i not in now]
+    for choices, words in ((one, "pinning agent {} instead"), (more, "pinning agent {} as well")):
+        best: tuple[float, tuple[int, ...]] | None = None
+        for pins in choices:
+            other = network.with_pinned(pins, weight)
+            if other.unreached():
+                continue
+            moved = attrs.evolve(loop, network=other)
+            feedback = moved.controller(moved.weights_perron)
+            ratio = feedback.weak / feedback.strong
+            if best is None or ratio > best[0]:
+                best = ratio, pins
+        if best is not None:
+            rate = _works(attrs.evolve(problem, ratio=best[0]), wanted)
+            if rate is not None:
+                return [f"{words.format(network.names[best[1][-1]])} gives {rate:.3g} 1/s"]
+    return []
