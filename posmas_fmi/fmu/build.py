@@ -12,14 +12,21 @@ import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from posmas_fmi import resources
 from posmas_fmi.errors import BuildError
 from posmas_fmi.expression import VectorFunction
-from posmas_fmi.fmu.compile import FLAGS, PLATFORMS, Platform, host, shared_library
+from posmas_fmi.fmu.compile import (
+    FLAGS,
+    PLATFORMS,
+    Platform,
+    buildable,
+    host,
+    shared_library,
+)
 from posmas_fmi.fmu.description import build_description, model_description
 from posmas_fmi.fmu.model import FmuModel
+from posmas_fmi.fmu.plant import agent_functions, read_plant, shipped_plants
 from posmas_fmi.fmu.positive_agent import positive_agent
 from posmas_fmi.fmu.sources import FmiVersion, compiled, instantiation_token, sources
 
@@ -167,7 +174,7 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
             raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
         if not isinstance(agent, dict):
             continue  # a scenario of plants that bring their own FMU
-        model = positive_agent(*_functions_of(agent, str(file)))
+        model = positive_agent(*agent_functions(agent, f"{file}: $.agent"))
         for fmi in (2, 3):
             version = _version(fmi)
             path = out_dir / file_name(model, version, (host(),))
@@ -179,24 +186,42 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
     return paths
 
 
-def _functions_of(
-    agent: Mapping[str, Any], where: str
-) -> tuple[VectorFunction, VectorFunction, int, int, int]:
-    try:
-        m, p, q = len(agent["A"]), len(agent["B"][0]), len(agent["C"])
-        x = [f"x{k + 1}" for k in range(m)]
-        u = [f"u{k + 1}" for k in range(p)]
-        g, sec = agent["g"], agent["sec"]
-    except (KeyError, TypeError, IndexError) as error:
-        raise BuildError(f"expected A, B, C, g, sec in [agent] ({error!r})", where) from error
-    place = f"{where}: $.agent"
-    return (
-        VectorFunction.parse(g, ["t", *x], f"{place}.g"),
-        VectorFunction.parse(sec, u, f"{place}.sec"),
-        m,
-        p,
-        q,
-    )
+def build_plants(
+    names: Sequence[str], out_dir: Path, platforms: Sequence[str] | None = None
+) -> list[Path]:
+    """Build shipped plants, ``<name>-fmi2.fmu`` and ``<name>-fmi3.fmu`` each.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Plants from `posmas_fmi.fmu.plant.shipped_plants`; empty for all.
+    out_dir : Path
+        Where the files go; files of that name are replaced.
+    platforms : sequence of str, optional
+        Default: all that this machine can compile for, see `buildable`.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    BuildError
+        If there is no such plant, or it cannot be built.
+    """
+    plants = shipped_plants()
+    for name in names:
+        if name not in plants:
+            raise BuildError(f"there is no plant {name!r}; shipped: {', '.join(plants)}")
+    paths = []
+    for name in names or plants:
+        model = read_plant(plants[name])
+        for fmi in (2, 3):
+            targets = _platforms(buildable(fmi) if platforms is None else platforms, fmi)
+            path = out_dir / f"{name}-fmi{fmi}.fmu"
+            write(path, archive(model, _version(fmi), targets))
+            paths.append(path)
+    return paths
 
 
 # ---- details ------------------------------------------------------------------------------------

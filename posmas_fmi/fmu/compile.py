@@ -135,6 +135,21 @@ def find_compiler(target: Platform) -> Compiler:
     )
 
 
+def buildable(fmi: int) -> list[str]:
+    """Return the platforms that this machine can compile for: its own, and with zig all others.
+
+    FMI 2 has one folder per system, which then holds the host's architecture or else x86_64.
+    """
+    if not importlib.util.find_spec("ziglang"):
+        return [host().name]
+    if fmi == 3:
+        return list(PLATFORMS)
+    folders = {host().fmi2: host().name}
+    for p in PLATFORMS.values():
+        folders.setdefault(p.fmi2, p.name)
+    return list(folders.values())
+
+
 def shared_library(
     files: Mapping[str, str], compiled: Sequence[str], name: str, target: Platform
 ) -> bytes:

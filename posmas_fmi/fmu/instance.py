@@ -217,6 +217,16 @@ class FmuFile:
             raise FmuError(f"the binary has no function {function}", str(self.path)) from None
         return int(ctypes.cast(symbol, ctypes.c_void_p).value or 0)
 
+    def variable(self, name: str) -> Variable:
+        """Return the variable of that name, or the array that has that element (``u[1]``).
+
+        Raises
+        ------
+        FmuError
+            If there is none; the message names the nearest one.
+        """
+        return self._variables.resolve(name)[0]
+
     def ports(self, names: Iterable[str]) -> Ports:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""
         return self._variables.ports(names)
@@ -325,10 +335,10 @@ class FmuInstance:
             If a name is unknown or a shape wrong.
         """
         values = values or {}
-        resolve = self.file._variables.resolve
+        variable = self.file.variable
         self.set(values)
         self.enter_initialization(start=start, stop=stop, tolerance=tolerance)
-        self.set({n: v for n, v in values.items() if resolve(n)[0].causality == "input"})
+        self.set({n: v for n, v in values.items() if variable(n).causality == "input"})
         self.exit_initialization()
 
     def enter_initialization(

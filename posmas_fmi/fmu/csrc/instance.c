@@ -144,7 +144,7 @@ Status instance_terminate(Instance *c)
 
 /* ---- values ------------------------------------------------------------------------------ */
 
-static Status finite(const Instance *c, unsigned at, unsigned n, Status status)
+static Status expect_finite(const Instance *c, unsigned at, unsigned n, Status status)
 {
     for (unsigned i = at; i < at + n; i++)
         if (!isfinite(c->state.v[i])) {
@@ -209,7 +209,7 @@ Status instance_get(Instance *c, const uint32_t vr[], size_t n, double value[], 
             know_outputs(c);
         else if (vr[i] >= AT_DX)
             know_derivatives(c);
-        Status one = finite(c, vr[i], (unsigned)size, STATUS_ERROR);
+        Status one = expect_finite(c, vr[i], (unsigned)size, STATUS_ERROR);
         status = one > status ? one : status;
         memcpy(value + done, c->state.v + vr[i], size * sizeof *value);
         done += size;
@@ -301,6 +301,12 @@ Status instance_directional(Instance *c, const uint32_t unknown[], size_t n_unkn
             return wrong_count(c, n_result);
         const double *from = unknown[i] < AT_Y ? sdx + (unknown[i] - AT_DX)
                                                : sy + (unknown[i] - AT_Y);
+        for (size_t j = 0; j < size; j++)
+            if (!isfinite(from[j])) {
+                instance_log(c, STATUS_ERROR, "%s has no finite derivative at time %.17g",
+                             model_name[unknown[i] + j], v[AT_TIME]);
+                return STATUS_ERROR;
+            }
         memcpy(result + done, from, size * sizeof *result);
         done += size;
     }
@@ -316,7 +322,8 @@ Status instance_step(Instance *c, double time, double step)
         return STATUS_ERROR;
     if (!isfinite(time) || !isfinite(step) || step <= 0 || !(time + step > time)) {
         instance_log(c, STATUS_ERROR,
-                     "expected a communication point and a step > 0 (got %.17g, %.17g)", time, step);
+                     "expected a communication point and a step > 0 (got %.17g, %.17g)", time,
+                     step);
         return STATUS_ERROR;
     }
     if (fabs(time - s->v[AT_TIME]) > time_slack(time)) {
@@ -394,7 +401,8 @@ Status instance_get_derivatives(Instance *c, double dx[], size_t n)
         return STATUS_ERROR;
     know_derivatives(c);
     memcpy(dx, c->state.v + AT_DX, n * sizeof *dx);
-    return finite(c, AT_DX, MODEL_NX, STATUS_DISCARD); /* the importer may try a shorter step */
+    /* Discard: the importer may try a shorter step. */
+    return expect_finite(c, AT_DX, MODEL_NX, STATUS_DISCARD);
 }
 
 Status instance_get_nominals(Instance *c, double nominal[], size_t n)
