@@ -20,7 +20,6 @@ from posmas_fmi.certify.sampled import contracts, rate_of, sampled_factor
 from posmas_fmi.certify.weights import Weights
 from posmas_fmi.network import Network
 
-
 Choice = Literal["auto", "p", "perron"]
 
 

@@ -67,7 +67,7 @@ def continuous_rate(A_high: Interval, feedback: Feedback) -> Rate | None:
 
 def metzler_majorant(J: Interval) -> Interval:
     """``⌈J⌉``: diagonal kept, moduli elsewhere."""
-    diagonal = np.eye(len(J.low), dtype=bool)
+    diagonal = np.eye(J.low.shape[-1], dtype=bool)
     crosses = (J.low <= 0) & (J.high >= 0)
     low, high = np.abs(J.low), np.abs(J.high)
     small = np.where(crosses, 0.0, np.minimum(low, high))

@@ -1,4 +1,4 @@
-"""Small interval matrices: products, and exponentials of Metzler matrices with small relative error.
+"""Small interval matrices: products, and exponentials that lose no digits to cancellation.
 
 ``A + σI ≥ 0`` turns every sum in the Taylor series of ``e^{Aτ} = e^{-στ} e^{(A+σI)τ}`` into a sum
 of non-negative terms: nothing cancels, so the enclosures stay tight entry by entry.

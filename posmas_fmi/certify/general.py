@@ -8,6 +8,7 @@ any ``A + H G(t)``, one period of agent i is bounded by ``|e^{Ah} - g M_ii Γ(A)
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import attrs
@@ -32,7 +33,7 @@ class _Terms:
     parts: list[Interval]  # (m, m) each: -B_a K_a, or EC
     low: Interval  # smallest gain
     high: Interval  # largest gain
-    own: Array  # distinct M_ii
+    own: Interval  # distinct M_ii, (n,)
     others: Array  # with it, bound of Σ_{j≠i} |M_ij| ν_j/ν_i
 
 
@@ -45,82 +46,83 @@ def _terms(loop: Loop, name: str, weights: Weights) -> _Terms:
         return _Terms(parts, phi * point(agent.m_l), phi * point(agent.m_h), *_rows(loop, weights))
     if loop.observer == "local":
         one = point(1.0)
-        return _Terms([loop.EC], one, one, np.ones(1), np.zeros(1))
+        return _Terms([loop.EC], one, one, point(1.0), np.zeros(1))
     mu = typed(loop.mu)
     return _Terms([loop.EC], mu, mu, *_rows(loop, weights))
 
 
-def _rows(loop: Loop, weights: Weights) -> tuple[Array, Array]:
+def _rows(loop: Loop, weights: Weights) -> tuple[Interval, Array]:
     network = loop.network
-    own = network.in_degree + (-1 if loop.protocol == "printed" else 1) * network.pinning
+    own = network.in_degree + network.pinning
     terms = int(np.diff(network.adjacency.indptr).max(initial=0)) + 4
     others = (network.adjacency @ weights.nu) / weights.nu * (1 + 4 * terms * UNIT)
     pairs = np.unique(np.column_stack([own, others]), axis=0)
     # of rows with the same M_ii only the one with the heaviest neighbours can be active
     last = np.append(pairs[1:, 0] != pairs[:-1, 0], True)
-    return pairs[last, 0], pairs[last, 1]
+    exact = pairs[last, 0]
+    rounded = 4 * terms * UNIT * np.abs(exact) * (exact % 1 != 0)
+    return Interval(exact - rounded, exact + rounded), pairs[last, 1]
 
 
 def continuous_rate(loop: Loop, name: str, weights: Weights) -> Rate | None:
     """Certificate C with ``⌈·⌉``; None where the bound is not finite."""
     if not np.isfinite(loop.H_ell.high).all():
         return None
-    rows = []
-    for own, others, gains in _vertices(_terms(loop, name, weights)):
-        fed, near = _sums(gains, own, others)
-        J = metzler_majorant(loop.A + -fed)
-        rows.append(J + loop.H_ell + near)
-    v = perron_vector(np.max([r.high for r in rows], axis=0))
-    bound = max(_worst(r, v) for r in rows)
-    return Rate(-bound, -bound, v)
+    rows = [
+        metzler_majorant(loop.A + -fed) + loop.H_ell + near
+        for fed, near in _vertices(_terms(loop, name, weights))
+    ]
+    proved = _worst(rows)
+    return (
+        None
+        if proved is None
+        else attrs.evolve(proved, value=-proved.value, estimate=-proved.estimate)
+    )
 
 
 def sampled_factor(loop: Loop, name: str, weights: Weights) -> Rate | None:
     """Certificate T with moduli; None where the bound is not finite."""
     if loop.period is None or not np.isfinite(loop.H_ell.high).all():
         return None
-    h = loop.period
-    _, plain, _, held = Flow(loop.A, loop.A).over(h)
-    plain_low, _, held_low, _ = Flow(loop.A, loop.A).over(h)
-    plain, held = Interval(plain_low.low, plain.high), Interval(held_low.low, held.high)
-    _, grown, _, grown_held = Flow(loop.A, loop.A_high).over(h)
-    spread = Interval(np.zeros_like(plain.low), (grown + -plain).high)
-    spread_held = Interval(np.zeros_like(plain.low), (grown_held + -held).high)
-    rows = []
-    for own, others, gains in _vertices(_terms(loop, name, weights)):
-        fed, near = _sums(gains, own, others)
-        moved = magnitude(plain + -matmul(held, fed))
-        rows.append(moved + spread + matmul(spread_held, magnitude(fed)) + matmul(grown_held, near))
-    top = np.max([r.high for r in rows], axis=0)
+    plain, grown, held, grown_held = Flow(loop.A, loop.A_high).over(loop.period)
+    zero = np.zeros_like(plain.low)
+    spread = Interval(zero, (grown + -plain).high)
+    spread_held = Interval(zero, (grown_held + -held).high)
+    rows = [
+        magnitude(plain + -matmul(held, fed))
+        + spread
+        + matmul(spread_held, magnitude(fed))
+        + matmul(grown_held, near)
+        for fed, near in _vertices(_terms(loop, name, weights))
+    ]
+    return _worst(rows)
+
+
+def _vertices(terms: _Terms) -> Iterator[tuple[Interval, Interval]]:
+    """``g M_ii N`` and ``g Σ|M_ij| |N|`` for all distinct rows, at each vertex of the gains."""
+    if len(terms.parts) > _MAX_INPUTS:
+        return
+    own = Interval(terms.own.low[:, None, None], terms.own.high[:, None, None])
+    others = Interval(np.zeros_like(own.low), terms.others[:, None, None])
+    same = bool((terms.low.low == terms.high.low).all())
+    ends = [terms.low] if same else [terms.low, terms.high]
+    for choice in product(ends, repeat=len(terms.parts)):
+        fed = near = point(np.zeros_like(terms.parts[0].low[None]))
+        for part, gain in zip(terms.parts, choice, strict=True):
+            whole = Interval(part.low[None], part.high[None]) * gain
+            fed = fed + whole * own
+            near = near + magnitude(whole) * others
+        yield fed, near
+
+
+def _worst(rows: list[Interval]) -> Rate | None:
+    """Bound of ``max_k (M v)_k / v_k`` over all matrices, with one v for all."""
+    if not rows:
+        return None
+    top = np.max([r.high.max(axis=0) for r in rows], axis=0)
     if not np.isfinite(top).all():
         return None
     v = perron_vector(top)
-    bound = max(_worst(r, v) for r in rows)
+    values = [matmul(M, point(v[:, None])).high[..., 0] for M in rows]
+    bound = max(float(np.nextafter(value / v, np.inf).max()) for value in values)
     return Rate(bound, bound, v)
-
-
-def _vertices(terms: _Terms):  # type: ignore[no-untyped-def]
-    """Every distinct row of M with every vertex of the gains."""
-    same = bool((terms.low.low == terms.high.low).all())
-    ends = [terms.low] if same else [terms.low, terms.high]
-    count = len(terms.parts) if len(terms.parts) <= _MAX_INPUTS else 0
-    for own, others in zip(terms.own, terms.others, strict=True):
-        for choice in product(ends, repeat=count):
-            yield own, others, list(zip(terms.parts, choice, strict=True))
-
-
-def _sums(
-    gains: list[tuple[Interval, Interval]], own: float, others: float
-) -> tuple[Interval, Interval]:
-    """``g M_ii N`` and ``g Σ|M_ij| |N|`` at one vertex."""
-    M_ii = typed(own).widen(4) if own % 1 else point(own)
-    fed = near = point(np.zeros_like(gains[0][0].low))
-    for part, gain in gains:
-        fed = fed + part * gain * M_ii
-        near = near + magnitude(part) * gain * Interval(np.zeros(1), np.array([others]))
-    return fed, near
-
-
-def _worst(M: Interval, v: Array) -> float:
-    value = matmul(M, point(v[:, None])).high[:, 0]
-    return float(np.nextafter(value / v, np.inf).max())

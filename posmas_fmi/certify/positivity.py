@@ -56,7 +56,7 @@ def non_positive_gain(loop: Loop) -> Condition:
 
 
 def metzler(loop: Loop, feedback: Feedback) -> Condition:
-    """``A - strong·N - |H|ℓ`` is Metzler (for the controller with the growth bound as well)."""
+    """Prove ``A - strong·N - |H|ℓ`` Metzler (for the controller with the growth bound as well)."""
     fed = feedback.N * point(feedback.strong)
     value = loop.A_low + -fed
     if feedback.name == "controller":

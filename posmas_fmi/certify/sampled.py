@@ -56,10 +56,11 @@ def contracts(factor: Rate | None, feedback: Feedback, h: float, positive: bool)
     form = "positive form" if positive else "entrywise moduli, as P does not hold"
     rate = rate_of(factor, h)
     speed = "no rate" if rate is None else f"rate >= {rate:.6g} 1/s"
+    weights = ", ".join(f"{x:.6g}" for x in factor.v)
     return Condition.from_margin(
         name,
         1.0 - factor.value,
         f"r = {factor.estimate:.9g}, proved r <= {factor.value:.9g} per period of {h:g} s "
-        f"({speed}) with v = [{', '.join(f'{x:.6g}' for x in factor.v)}], {form}, interval arithmetic",
+        f"({speed}) with v = [{weights}], {form}, interval arithmetic",
         f"weakest at {feedback.weakest}",
     )

@@ -70,7 +70,7 @@ def _pins(loop: Loop, problem: Problem, wanted: float) -> list[str]:
         return []
     now = network.pinned
     weight = float(network.pinning.max())
-    one = [tuple([i]) for i in range(network.N) if len(now) == 1 and i not in now]
+    one = [(i,) for i in range(network.N) if len(now) == 1 and i not in now]
     more = [(*now, i) for i in range(network.N) if i not in now]
     for choices, words in ((one, "pinning agent {} instead"), (more, "pinning agent {} as well")):
         best: tuple[float, tuple[int, ...]] | None = None

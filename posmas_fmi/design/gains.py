@@ -17,7 +17,8 @@ def design(
     agent: Agent, network: Network, settings: DesignSettings, period: float | None
 ) -> Design:
     """Certify ``settings.K`` and ``settings.E``."""
-    assert settings.K is not None and settings.E is not None
+    assert settings.K is not None, "settings check it"
+    assert settings.E is not None, "settings check it"
     return certified(agent, network, settings.K, settings.E, settings, period)
 
 

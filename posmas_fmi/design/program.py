@@ -139,9 +139,8 @@ class _Constraints:
     def entries(self, left: Array) -> Array:
         """Coefficients of ``(left · problem.left) X right`` entry by entry, (m, m, count)."""
         full = left @ self.problem.left
-        return np.einsum("ia,bj->ijab", full, self.problem.right).reshape(
-            len(left), self.problem.right.shape[1], self.count
-        )
+        products: Array = np.einsum("ia,bj->ijab", full, self.problem.right)
+        return products.reshape(len(left), self.problem.right.shape[1], self.count)
 
     def _signs(self) -> tuple[Array, Array, Array]:
         """``rows x <= limits`` for P and T, and which rows may give way."""

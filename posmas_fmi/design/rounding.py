@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def nearest(M: Array, digits: int, relative_zero: float = 1e-9) -> Array:
 
 
 def towards_zero(M: Array, digits: int, relative_zero: float = 1e-9) -> Array:
-    """The same, never larger in modulus.
+    """Round as `nearest` does, but never to a larger modulus.
 
     Examples
     --------
@@ -31,7 +32,7 @@ def towards_zero(M: Array, digits: int, relative_zero: float = 1e-9) -> Array:
     return _rounded(M, digits, relative_zero, math.trunc)
 
 
-def _rounded(M: Array, digits: int, relative_zero: float, integer) -> Array:  # type: ignore[no-untyped-def]
+def _rounded(M: Array, digits: int, relative_zero: float, integer: Callable[[float], int]) -> Array:
     top = float(np.abs(M).max(initial=0.0))
     out = np.zeros_like(M, dtype=float)
     for index, value in np.ndenumerate(M):

@@ -136,10 +136,10 @@ class DesignSettings:
             value: Array | None = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise InputError("expected finite numbers", f"$.design.{name}")
-        for value in self.disturbance or ():
-            if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
+        for bound in self.disturbance or ():
+            if not 0.0 <= bound < math.inf:
                 raise InputError(
-                    f"expected finite bounds >= 0 (got {value!r})", "$.design.disturbance"
+                    f"expected finite bounds >= 0 (got {bound!r})", "$.design.disturbance"
                 )
         if not 2 <= self.digits <= 15:
             raise InputError(f"expected 2 to 15 (got {self.digits})", "$.design.digits")
