@@ -90,10 +90,8 @@ class Outcome:
         tracking error is that of the estimate where the plant does not show x.
     largest_initial : float
         Largest tracking error at the start.
-    min_state : float
-        Smallest state seen at a communication point.
-    min_at : tuple of (float, int)
-        Its time and agent (from 0).
+    min_state, min_time : (N,) array
+        Smallest state of each agent at a communication point, and when [s].
     messages, lost : int
     reason : str
         Empty for a complete run.
@@ -105,8 +103,8 @@ class Outcome:
     tracking_error: Array
     estimation_error: Array
     largest_initial: float
-    min_state: float
-    min_at: tuple[float, int]
+    min_state: Array
+    min_time: Array
     messages: int
     lost: int
     reason: str = ""
@@ -165,7 +163,8 @@ class _Run:
             0, system.xhat0.copy(), system.s0.copy(), Mailbox(system.channel, empty, random)
         )
         self.largest_initial = 0.0
-        self.min_state, self.min_at = np.inf, (0.0, 0)
+        self.min_state = np.full(system.network.N, np.inf)
+        self.min_time = np.zeros(system.network.N)
         self.tracking = self.estimation = np.zeros(system.network.N)
         self.limit = np.inf
 
@@ -188,8 +187,8 @@ class _Run:
             tracking_error=self.tracking,
             estimation_error=self.estimation,
             largest_initial=self.largest_initial,
-            min_state=float(self.min_state),
-            min_at=self.min_at,
+            min_state=self.min_state,
+            min_time=self.min_time,
             messages=state.mailbox.sent,
             lost=state.mailbox.lost,
             reason=reason,
@@ -247,9 +246,10 @@ class _Run:
             self.largest_initial = float(self.tracking.max())
             scale = max(np.abs(truth).max(), np.abs(state.s).max(), np.abs(state.xhat).max(), 1.0)
             self.limit = DIVERGED * float(scale)
-        lowest = int(truth.min(axis=1).argmin())
-        if truth[lowest].min() < self.min_state:
-            self.min_state, self.min_at = float(truth[lowest].min()), (t, lowest)
+        lowest = truth.min(axis=1)
+        falls = lowest < self.min_state
+        self.min_state = np.where(falls, lowest, self.min_state)
+        self.min_time = np.where(falls, t, self.min_time)
         size = np.maximum(np.abs(truth).max(axis=1), np.abs(state.xhat).max(axis=1))
         if not (size <= self.limit).all():
             self._diverged(t, size)

@@ -67,7 +67,7 @@ class Recorder:
 
         self._layout = layout
         self._rows: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
-        self._written = 0
+        self._written: dict[str, int] = dict.fromkeys(self._rows, 0)
         self._file = h5netcdf.File(path, "w")
         self._define(network, variables, attributes)
 
@@ -98,30 +98,40 @@ class Recorder:
         time.attrs["units"] = "s"
         for name in variables:
             dimensions, sizes = layout.shape(name)
-            file.create_variable(name, ("time", *dimensions), float, chunks=_chunks(sizes))
+            file.create_variable(
+                name, ("time", *dimensions), float, chunks=_chunks(sizes), fillvalue=np.nan
+            )
         file.attrs.update({**attributes, "complete": 0})
         file.flush()
 
     def record(self, time: float, values: dict[str, Array]) -> None:
-        """Add one row; the arrays are copied."""
+        """Add one row; the arrays are copied. A variable that is left out stays NaN there."""
         self._rows["time"].append(np.asarray(time))
+        self.add(values)
+
+    def add(self, values: dict[str, Array]) -> None:
+        """Add a row of these variables only, after the last row that they have."""
         for name, value in values.items():
             self._rows[name].append(np.array(value, dtype=float))
-        if len(self._rows["time"]) >= CHUNK:
+        if max(len(rows) for rows in self._rows.values()) >= CHUNK:
             self.flush()
 
     def flush(self) -> None:
         """Write what is held in memory."""
-        count = len(self._rows["time"])
-        if not count:
-            return
-        first, last = self._written, self._written + count
-        self._file.resize_dimension("time", last)
+        ends = {name: self._written[name] + len(rows) for name, rows in self._rows.items()}
+        if ends["time"] > self._written["time"]:
+            self._file.resize_dimension("time", ends["time"])
         for name, rows in self._rows.items():
-            self._file.variables[name][first:last] = np.stack(rows)
-            rows.clear()
-        self._written = last
+            if rows:
+                self._file.variables[name][self._written[name] : ends[name]] = np.stack(rows)
+                rows.clear()
+        self._written = ends
         self._file.flush()
+
+    @property
+    def rows(self) -> int:
+        """Number of communication points recorded."""
+        return self._written["time"] + len(self._rows["time"])
 
     def finish(self) -> None:
         """Write the rest and mark the result as complete."""

@@ -1,0 +1,309 @@
+"""The commands. No logic here: each one calls a function of the package and prints its result."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from posmas_fmi.errors import InputError, NotBuiltError, PosmasError
+
+if TYPE_CHECKING:
+    from posmas_fmi.cosim.master import Progress
+    from posmas_fmi.design import Design
+
+DONE, NEGATIVE, CANCELLED = 0, 1, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments; those of the process by default.
+
+    Returns
+    -------
+    int
+        0 done, 1 a verdict is negative, 2 bad input, 3 an FMU failed, 130 cancelled.
+    """
+    arguments = _parser().parse_args(argv)
+    logging.basicConfig(level=logging.DEBUG if arguments.verbose else logging.WARNING)
+    try:
+        command: Callable[[argparse.Namespace], int] = arguments.command
+        return command(arguments)
+    except PosmasError as error:
+        print(f"posmas-fmi: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("posmas-fmi: cancelled", file=sys.stderr)
+        return CANCELLED
+    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        sys.stderr.close()
+        return DONE
+
+
+# ---- the commands -------------------------------------------------------------------------------
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.scenario import load, run
+
+    scenario = load(arguments.scenario, arguments.period, arguments.until, arguments.seed)
+    folder = arguments.out or Path("out") / scenario.name
+    result = run(scenario, folder, _progress, command=_command_line(arguments))
+    summary, certificate = result.summary, result.design.certificate
+    if arguments.json:
+        _print_json({**summary, "certified": certificate.certified, "folder": str(folder)})
+    else:
+        print(f"verdict    {summary['verdict']}")
+        if summary["reason"]:
+            print(f"           {summary['reason']}")
+        print(f"certified  {_certified(result.design)}")
+        print(f"error      {_number(summary['tracking_error_final'])} to the leader at the end")
+        print(f"min state  {_number(summary['min_state'])}")
+        print(f"report     {folder / 'report.html'}")
+    if summary["verdict"] == "failed":
+        return 3
+    if summary["verdict"] == "cancelled":
+        return CANCELLED
+    return DONE if result.good else NEGATIVE
+
+
+def _design(arguments: argparse.Namespace) -> int:
+    import attrs
+
+    from posmas_fmi.scenario import load
+    from posmas_fmi.scenario.run import make_design_of
+
+    scenario = load(arguments.scenario)
+    if arguments.method:
+        settings = attrs.evolve(scenario.design, method=arguments.method)
+        scenario = attrs.evolve(scenario, design=settings)
+    return _show_design(make_design_of(scenario), arguments.json)
+
+
+def _certify(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.design import certify
+    from posmas_fmi.scenario import load
+
+    scenario = load(arguments.scenario)
+    K, E = _read_gains(arguments.gains)
+    made = certify(scenario.agent, scenario.network, K, E, scenario.design, scenario.clock.h)
+    return _show_design(made, arguments.json)
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.report import write_report
+
+    print(write_report(arguments.folder))
+    return DONE
+
+
+def _models(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.scenario.build import shipped_scenarios
+
+    for path in shipped_scenarios():
+        title = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        print(f"{path.stem:28}{title}")
+    return DONE
+
+
+def _fmu_build(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.shipped import build
+
+    for path in build(arguments.names):
+        print(path)
+    return DONE
+
+
+def _regress(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.compare import regress
+
+    result = regress(arguments.fmu, arguments.reference)
+    if arguments.json:
+        _print_json(result.to_dict())
+    else:
+        print(result)
+    return DONE if result.passed else NEGATIVE
+
+
+def _not_built(name: str) -> Callable[[argparse.Namespace], int]:
+    def command(arguments: argparse.Namespace) -> int:
+        raise NotBuiltError(f"'posmas-fmi {name}' is not in this version yet")
+
+    return command
+
+
+# ---- output -------------------------------------------------------------------------------------
+
+
+def _show_design(made: Design, as_json: bool) -> int:
+    if as_json:
+        _print_json(made.to_dict())
+    else:
+        certificate = made.certificate
+        print(f"method        {made.method} ({made.observer} observer)")
+        print(f"pinned        {', '.join(made.pinned)}")
+        print(f"K             {made.K.tolist()}")
+        print(f"E             {made.E.tolist()}")
+        print(f"certified     {_certified(made)}")
+        print(f"rate          {_number(certificate.rate)} 1/s")
+        print(f"observer      {_number(certificate.observer_rate)} 1/s")
+        print(f"non-negative  {'proved' if certificate.positive else 'not proved'}")
+        for condition in certificate.conditions:
+            mark = "holds" if condition.holds else "FAILS"
+            print(f"  {mark}  {condition.name} (margin {_number(condition.margin)})")
+        for note in made.notes:
+            print(f"  note: {note}")
+    return DONE if made.certificate.certified != "no" else NEGATIVE
+
+
+def _certified(made: Design) -> str:
+    certificate = made.certificate
+    if certificate.certified == "conditional":
+        open_ = [a for a in certificate.assumptions if a.status != "verified"]
+        words = "; ".join(f"{a.name} {a.status}: {a.detail}" for a in open_)
+        return f"conditional ({words})"
+    if certificate.certified == "no":
+        return f"no ({'; '.join(c.name for c in certificate.failing)})"
+    return certificate.certified
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(json.dumps(content, indent=2, allow_nan=False))
+
+
+def _command_line(arguments: argparse.Namespace) -> str:
+    parts = ["posmas-fmi", "run", arguments.scenario]
+    for name in ("until", "period", "seed"):
+        value = getattr(arguments, name)
+        if value is not None:
+            parts += [f"--{name}", f"{value:g}"]
+    return " ".join(parts)
+
+
+def _progress(label: str) -> Progress | None:
+    """Progress on stderr, on a terminal only: per cent and time left, twice a second."""
+    if not sys.stderr.isatty():
+        return None
+    began = time.monotonic()
+    shown = began
+
+    def progress(done: int, total: int) -> None:
+        nonlocal shown
+        now = time.monotonic()
+        if now - shown < 0.5 and done < total:
+            return
+        shown = now
+        left = (now - began) / done * (total - done)
+        end = "\n" if done == total else ""
+        print(f"\r{label} {done / total:4.0%}, {left:.0f} s left  ", end=end, file=sys.stderr)
+        sys.stderr.flush()
+
+    return progress
+
+
+# ---- input --------------------------------------------------------------------------------------
+
+
+def _read_gains(path: Path) -> tuple[Any, Any]:
+    """Read K and E from a JSON file, also from a design.json."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f'expected a JSON file like {{"K": [[..]], "E": [[..]]}} ({error})', str(path)
+        ) from None
+    missing = [k for k in ("K", "E") if not isinstance(content, dict) or k not in content]
+    if missing:
+        raise InputError(f"the key {missing[0]} is missing", str(path))
+    return content["K"], content["E"]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="posmas-fmi",
+        description="Design, prove and co-simulate pinning consensus of positive networks.",
+    )
+    parser.add_argument("--verbose", action="store_true", help="log what happens to stderr")
+    parser.add_argument("--version", action=_Version, help="print the version and end")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def add(name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
+        command = commands.add_parser(name, help=text, description=text)
+        command.set_defaults(command=function)
+        return command
+
+    run = add("run", _run, "design, certify, co-simulate, report")
+    run.add_argument("scenario", help="a file, or the name of a shipped scenario")
+    run.add_argument("--out", type=Path, help="output folder (default out/<name>)")
+    run.add_argument("--until", type=_positive, metavar="S", help="end of the run [s]")
+    run.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
+    run.add_argument("--seed", type=int, metavar="N", help="of every random number")
+    run.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+    design = add("design", _design, "find gains and prove what they do")
+    design.add_argument("scenario")
+    design.add_argument("--method", choices=("contraction", "lmi", "paper-1", "paper-2"))
+    design.add_argument("--json", action="store_true")
+
+    certify = add("certify", _certify, "certificate for given gains")
+    certify.add_argument("scenario")
+    certify.add_argument("--gains", type=Path, required=True, metavar="FILE.json")
+    certify.add_argument("--json", action="store_true")
+
+    report = add("report", _report, "write the report again from stored results")
+    report.add_argument("folder", type=Path, metavar="DIR")
+
+    add("models", _models, "list the shipped scenarios")
+
+    fmu = add("fmu", _fmu_build, "build the shipped FMUs")
+    actions = fmu.add_subparsers(required=True, metavar="ACTION")
+    build = actions.add_parser("build", help="(re)build the shipped FMUs")
+    build.add_argument("names", nargs="*", metavar="NAME")
+
+    regress = add("regress", _regress, "compare an FMU with a reference result")
+    regress.add_argument("fmu", type=Path)
+    regress.add_argument("reference", type=Path, metavar="REFERENCE.csv")
+    regress.add_argument("--json", action="store_true")
+
+    paper = add("paper", _not_built("paper"), "what the paper prints against what is true")
+    paper.add_argument("--json", action="store_true")
+    for name, text in (
+        ("check", "preflight of any FMU"),
+        ("linearise", "linear model of an FMU at an operating point"),
+    ):
+        later = add(name, _not_built(name), f"{text} (not in this version yet)")
+        later.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    return parser
+
+
+class _Version(argparse.Action):
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:  # noqa: A002
+        super().__init__(option_strings, dest, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        parser.exit(message=f"posmas-fmi {version('posmas-fmi')}\n")
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number of seconds > 0 (got {text!r})")
+    return value

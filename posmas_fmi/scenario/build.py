@@ -1,0 +1,443 @@
+"""From the tables of a scenario file to agent, network, design settings and channel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+import attrs
+import numpy as np
+import scipy.sparse as sp
+
+from posmas_fmi import resources
+from posmas_fmi.agent import Agent, state_names
+from posmas_fmi.cosim.channel import Channel
+from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.design import DesignSettings
+from posmas_fmi.errors import InputError, PosmasError, ScenarioError
+from posmas_fmi.expression import Array, VectorFunction, parse
+from posmas_fmi.network import Network, network_from_arcs, read_adjacency
+from posmas_fmi.scenario.reading import read_tables
+from posmas_fmi.scenario.tables import (
+    AgentTable,
+    ChannelTable,
+    Count,
+    NetworkTable,
+    PlantTable,
+    ScenarioFile,
+    ScenarioTable,
+    Uniform,
+)
+
+T = TypeVar("T")
+
+
+@attrs.frozen(eq=False)
+class Scenario:
+    """Everything a run needs, checked.
+
+    Attributes
+    ----------
+    settings : ScenarioTable
+        Name, tolerance and so on.
+    agent : Agent
+    network : Network
+        Without pinned agents where `pins` says how many are to be chosen.
+    pins : int
+        How many agents the design is to pin; 0 if the scenario names them.
+    design : DesignSettings
+    plant : PlantTable
+    clock : Clock
+    channel : ChannelTable
+    x0, xhat0 : (N, m) array
+    s0 : (m,) array
+    baseline : bool
+        Whether the run without control is made as well.
+    path : Path
+        The file.
+    inputs : tuple of Path
+        Other files that it reads.
+    text : str
+        Its content.
+    """
+
+    settings: ScenarioTable
+    agent: Agent
+    network: Network
+    pins: int
+    design: DesignSettings
+    plant: PlantTable
+    clock: Clock
+    channel: ChannelTable
+    x0: Array
+    xhat0: Array
+    s0: Array
+    baseline: bool
+    path: Path
+    inputs: tuple[Path, ...]
+    text: str
+
+    @property
+    def name(self) -> str:
+        """Name of the scenario."""
+        return self.settings.name
+
+
+def find(name_or_path: str) -> Path:
+    """Return the file of a scenario given by path, or by the name of a shipped one.
+
+    Raises
+    ------
+    InputError
+        If there is neither, with the nearest shipped name.
+    """
+    path = Path(name_or_path)
+    if path.exists() or path.suffix == ".toml" or len(path.parts) > 1:
+        return path
+    names = [file.stem for file in shipped_scenarios()]
+    if name_or_path in names:
+        return resources.shipped("models") / f"{name_or_path}.toml"
+    near = get_close_matches(name_or_path, names, 1)
+    hint = f"did you mean {near[0]}?" if near else "'posmas-fmi models' lists them"
+    raise InputError(f"there is no shipped scenario {name_or_path!r} and no such file; {hint}")
+
+
+def shipped_scenarios() -> list[Path]:
+    """Return the files of the shipped scenarios."""
+    return sorted(resources.shipped("models").glob("*.toml"))
+
+
+def load(
+    name_or_path: str,
+    period: float | None = None,
+    until: float | None = None,
+    seed: int | None = None,
+) -> Scenario:
+    """Read and check a scenario.
+
+    Parameters
+    ----------
+    name_or_path : str
+        A file, or the name of a shipped scenario.
+    period, until : float, optional
+        Replace those of the file [s].
+    seed : int, optional
+        Replaces that of the file.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    InputError
+        ScenarioError where there are several mistakes, with all of them.
+
+    Examples
+    --------
+    >>> load("paper_example_1").agent.m
+    2
+    """
+    path = find(name_or_path)
+    tables, text = read_tables(path)
+    given: dict[str, Any] = {"period": period, "until": until, "seed": seed}
+    head = attrs.evolve(tables.scenario, **{k: v for k, v in given.items() if v is not None})
+    return _Builder(attrs.evolve(tables, scenario=head), path, text).build()
+
+
+class _Builder:
+    """Builds part by part and gathers the problems of all parts."""
+
+    def __init__(self, tables: ScenarioFile, path: Path, text: str) -> None:
+        self.tables, self.path, self.text = tables, path, text
+        self.problems: list[tuple[str, str]] = []
+
+    def build(self) -> Scenario:
+        tables = self.tables
+        self.check_name()
+        clock = self.attempt(lambda: Clock.of(tables.scenario.until, tables.scenario.period))
+        agent = self.attempt(lambda: make_agent(tables.agent))
+        network = self.attempt(lambda: make_network(tables.network, self.path.parent))
+        design = self.attempt(lambda: make_design(tables.design))
+        if tables.plant.fmi not in (2, 3):
+            self.problems.append(("$.plant.fmi", f"expected 2 or 3 (got {tables.plant.fmi})"))
+        for k, override in enumerate(tables.plant.override):
+            if network and not 1 <= override.agent <= network.N:
+                self.problems.append(
+                    (
+                        f"$.plant.override[{k}].agent",
+                        f"expected 1 to {network.N} (got {override.agent})",
+                    )
+                )
+        x0 = xhat0 = s0 = None
+        if agent and network and clock:
+            random = np.random.default_rng(tables.scenario.seed)
+            n, m = network.N, agent.m
+            x0 = self.attempt(lambda: initial(tables.initial.x, n, m, random, "$.initial.x"))
+            xhat0 = self.attempt(
+                lambda: initial(tables.initial.xhat, n, m, random, "$.initial.xhat")
+            )
+            s0 = self.attempt(lambda: _leader(tables.leader.s0, m))
+            self.attempt(lambda: make_channel(tables.channel, network, clock.h))
+        if self.problems:
+            raise ScenarioError(tuple(self.problems), str(self.path))
+        assert agent is not None
+        assert network is not None
+        assert design is not None
+        assert clock is not None
+        assert x0 is not None
+        assert xhat0 is not None
+        assert s0 is not None
+        pinned = tables.network.pinned
+        pins = pinned.count if isinstance(pinned, Count) else int(pinned == "auto")
+        return Scenario(
+            settings=tables.scenario,
+            agent=agent,
+            network=network,
+            pins=pins,
+            design=design,
+            plant=tables.plant,
+            clock=clock,
+            channel=tables.channel,
+            x0=x0,
+            xhat0=xhat0,
+            s0=s0,
+            baseline=tables.report.baseline,
+            path=self.path,
+            inputs=self.inputs(),
+            text=self.text,
+        )
+
+    def inputs(self) -> tuple[Path, ...]:
+        file = self.tables.network.file
+        return () if file is None else (self.path.parent / file,)
+
+    def attempt(self, make: Callable[[], T]) -> T | None:
+        try:
+            return make()
+        except ScenarioError as error:
+            self.problems += error.problems
+        except PosmasError as error:
+            self.problems.append((error.where or "$", error.message))
+        return None
+
+    def check_name(self) -> None:
+        name = self.tables.scenario.name
+        if not name or name in (".", "..") or any(c in name for c in '/\\:*?"<>|\0\n'):
+            self.problems.append(
+                ("$.scenario.name", f"expected a name that can be a folder (got {name!r})")
+            )
+        if self.tables.scenario.tolerance <= 0:
+            self.problems.append(("$.scenario.tolerance", "expected a number > 0"))
+        if self.tables.scenario.seed < 0:
+            self.problems.append(("$.scenario.seed", "expected a whole number >= 0"))
+
+
+def make_agent(table: AgentTable) -> Agent:
+    """Build the agent; every expression that cannot be read is reported.
+
+    Raises
+    ------
+    InputError
+    """
+    m = len(table.A)
+    p = len(table.B[0]) if table.B else 0
+    matrices: dict[str, Any] = {
+        name: _matrix(getattr(table, name), f"$.agent.{name}") for name in "ABC"
+    }
+    matrices["H"] = np.zeros((m, m)) if table.H is None else _matrix(table.H, "$.agent.H")
+    inputs = [f"u{k + 1}" for k in range(p)]
+    problems: list[tuple[str, str]] = []
+    functions: dict[str, Any] = {}
+    for name, texts, variables in (
+        ("g", table.g or ["0"] * m, state_names(m)),
+        ("sec", table.sec or inputs, inputs),
+    ):
+        expressions = []
+        for k, text in enumerate(texts):
+            try:
+                expressions.append(parse(text, variables, f"$.agent.{name}[{k}]"))
+            except PosmasError as error:
+                problems.append((error.where, error.message))
+        functions[name] = VectorFunction(tuple(expressions), tuple(variables))
+    region = _region(table.region, m, p, problems)
+    if problems:
+        raise ScenarioError(tuple(problems))
+    return Agent(
+        **matrices,
+        **functions,
+        sector=table.sector,
+        lipschitz=table.lipschitz,
+        region=region,
+    )
+
+
+def _matrix(rows: list[list[float]], place: str) -> Array:
+    if not rows or not rows[0]:
+        raise InputError("expected a matrix with at least one entry", place)
+    for k, row in enumerate(rows):
+        if len(row) != len(rows[0]):
+            raise InputError(
+                f"expected {len(rows[0])} entries as in the first row (got {len(row)})",
+                f"{place}[{k}]",
+            )
+    return np.array(rows, dtype=float)
+
+
+def _region(
+    table: dict[str, tuple[float, float]], m: int, p: int, problems: list[tuple[str, str]]
+) -> dict[str, tuple[float, float]]:
+    """Expand ``x`` and ``u`` to every state and input."""
+    states, inputs = state_names(m)[1:], [f"u{k + 1}" for k in range(p)]
+    groups = {"x": states, "u": inputs, **{name: [name] for name in ["t", *states, *inputs]}}
+    region: dict[str, tuple[float, float]] = {}
+    for name, (low, high) in sorted(table.items(), key=lambda item: len(item[0])):
+        place = f"$.agent.region.{name}"
+        if name not in groups:
+            problems.append((place, f"expected one of {', '.join(groups)}"))
+        elif low > high:
+            problems.append((place, f"expected [low, high] (got [{low:g}, {high:g}])"))
+        else:
+            region |= dict.fromkeys(groups[name], (low, high))
+    return region
+
+
+def make_network(table: NetworkTable, folder: Path) -> Network:
+    """Build the network from its arcs or its file.
+
+    Raises
+    ------
+    InputError
+    """
+    pinned = table.pinned if isinstance(table.pinned, list) else []
+    if (table.arcs is None) == (table.file is None):
+        raise InputError("expected either arcs (with agents) or file", "$.network")
+    if table.arcs is not None:
+        if table.agents is None:
+            raise InputError("this key is missing: how many agents there are", "$.network.agents")
+        network = network_from_arcs(table.agents, table.arcs, pinned, table.names)
+    else:
+        adjacency, names = read_adjacency(folder / str(table.file))
+        _check_pins(pinned, adjacency.shape[0])
+        weights = np.bincount([k - 1 for k in pinned], minlength=adjacency.shape[0]).clip(max=1)
+        network = Network(sp.csr_array(adjacency), weights, tuple(table.names) or names)
+    if len(set(network.names)) < network.N:
+        raise InputError("expected a different name for each agent", "$.network.names")
+    if isinstance(table.pinned, Count) and not 1 <= table.pinned.count <= network.N:
+        raise InputError(
+            f"expected 1 to {network.N} (got {table.pinned.count})", "$.network.pinned.count"
+        )
+    if isinstance(table.pinned, list):
+        if not pinned:
+            raise InputError(
+                'expected at least one pinned agent, or "auto": somebody must know the leader',
+                "$.network.pinned",
+            )
+        network.require_reached()
+    return network
+
+
+def _check_pins(pinned: list[int], agents: int) -> None:
+    for k, agent in enumerate(pinned):
+        if not 1 <= agent <= agents:
+            raise InputError(
+                f"expected agents from 1 to {agents} (got {agent})", f"$.network.pinned[{k}]"
+            )
+
+
+def make_design(table: dict[str, Any]) -> DesignSettings:
+    """Build the design settings; unknown keys are refused with the nearest known one.
+
+    Raises
+    ------
+    InputError
+    """
+    known = [a.name for a in attrs.fields(DesignSettings)]
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        problems = []
+        for key in unknown:
+            near = get_close_matches(key, known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
+            problems.append((f"$.design.{key}", f"unknown key; {hint}"))
+        raise ScenarioError(tuple(problems))
+    return DesignSettings(**table)
+
+
+def initial(value: Any, n: int, m: int, random: np.random.Generator, place: str) -> Array:
+    """Make initial states (n, m) from a number, one value per state, one row per agent, or Uniform.
+
+    Raises
+    ------
+    InputError
+
+    Examples
+    --------
+    >>> initial([1.0, 2.0], 3, 2, np.random.default_rng(0), "x")
+    array([[1., 2.],
+           [1., 2.],
+           [1., 2.]])
+    """
+    if isinstance(value, Uniform):
+        low, high = value.uniform
+        if low > high:
+            raise InputError(f"expected [low, high] (got [{low:g}, {high:g}])", f"{place}.uniform")
+        return random.uniform(low, high, (n, m))
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        array = _matrix(value, place)
+        if array.shape != (n, m):
+            raise InputError(
+                f"expected {n} rows, one per agent, of {m} states (got {array.shape})", place
+            )
+        return array
+    array = np.atleast_1d(np.asarray(value, dtype=float))
+    if array.size not in (1, m):
+        raise InputError(f"expected one value or {m}, one per state (got {array.size})", place)
+    return np.array(np.broadcast_to(array, (n, m)))
+
+
+def _leader(s0: list[float], m: int) -> Array:
+    if len(s0) != m:
+        raise InputError(f"expected {m} values, one per state (got {len(s0)})", "$.leader.s0")
+    if min(s0) < 0:
+        raise InputError("expected a non-negative leader: agents are positive", "$.leader.s0")
+    return np.array(s0, dtype=float)
+
+
+def make_channel(table: ChannelTable, network: Network, h: float) -> Channel:
+    """Build the channel over the arcs of the network and those from the leader.
+
+    Raises
+    ------
+    InputError
+    """
+    arcs = network.adjacency.nnz + len(network.pinned)
+    channel = Channel.uniform(arcs, h, table.delay, table.jitter, table.loss)
+    delay, jitter, loss = channel.delay.copy(), channel.jitter.copy(), channel.loss.copy()
+    numbers = _arc_numbers(network)
+    for k, arc in enumerate(table.arc):
+        place = f"$.channel.arc[{k}]"
+        number = numbers.get(arc.arc)
+        if number is None:
+            raise InputError(
+                f"there is no arc from {arc.arc[0]} to {arc.arc[1]} in the network", f"{place}.arc"
+            )
+        try:
+            one = Channel.uniform(1, h, arc.delay, arc.jitter, arc.loss)
+        except InputError as error:
+            raise InputError(error.message, f"{place}.{error.where.split('.')[-1]}") from None
+        delay[number], jitter[number], loss[number] = one.delay[0], one.jitter[0], one.loss[0]
+    return Channel(delay, jitter, loss)
+
+
+def _arc_numbers(network: Network) -> dict[tuple[int, int], int]:
+    """Return the number of each arc (from, to), agents counted from 1 and the leader being 0."""
+    a = network.adjacency
+    receiver = np.repeat(np.arange(network.N), np.diff(a.indptr))
+    numbers = {
+        (int(j) + 1, int(i) + 1): k
+        for k, (j, i) in enumerate(zip(a.indices, receiver, strict=True))
+    }
+    return numbers | {(0, i + 1): a.nnz + k for k, i in enumerate(network.pinned)}

@@ -1,0 +1,247 @@
+"""From TOML text to tables: strict types, unknown keys refused, every mistake reported at once."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+import types
+import typing
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import attrs
+import cattrs
+from cattrs.errors import (
+    AttributeValidationNote,
+    ClassValidationError,
+    ForbiddenExtraKeysError,
+    IterableValidationError,
+    IterableValidationNote,
+)
+
+from posmas_fmi.errors import InputError, ScenarioError
+from posmas_fmi.scenario.tables import Count, Port, ScenarioFile, Uniform
+
+LARGEST_FILE = 50_000_000  # bytes
+
+
+def read_tables(path: Path) -> tuple[ScenarioFile, str]:
+    """Read a scenario file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    tables : ScenarioFile
+    text : str
+        The file as it was.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it is not text.
+    ScenarioError
+        Naming every key that is missing, unknown or of the wrong type.
+    """
+    text = _read_text(path)
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"this is not TOML: {error}", str(path)) from None
+    except RecursionError:
+        raise InputError("the file is nested too deeply to be a scenario", str(path)) from None
+    if not document:
+        raise InputError(
+            "the file is empty; start from a shipped scenario, see 'posmas-fmi models'", str(path)
+        )
+    try:
+        return _converter().structure(document, ScenarioFile), text
+    except (ClassValidationError, IterableValidationError) as error:
+        raise ScenarioError(tuple(_problems(error, "$")), str(path)) from None
+
+
+def _read_text(path: Path) -> str:
+    if path.is_dir():
+        raise InputError("expected a scenario file (got a folder)", str(path))
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(
+                f"the file is larger than {LARGEST_FILE // 1_000_000} MB; "
+                "keep large networks in a file of their own ($.network.file)",
+                str(path),
+            )
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise InputError(
+            "no such file; 'posmas-fmi models' lists the shipped scenarios", str(path)
+        ) from None
+    except UnicodeDecodeError:
+        raise InputError("this is not a text file in UTF-8", str(path)) from None
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", str(path)) from None
+
+
+# ---- strict structuring -------------------------------------------------------------------------
+
+
+def _converter() -> cattrs.Converter:
+    converter = cattrs.Converter(forbid_extra_keys=True, detailed_validation=True)
+    converter.register_structure_hook(float, _number)
+    converter.register_structure_hook(int, _whole)
+    converter.register_structure_hook(str, _text)
+    converter.register_structure_hook(bool, _truth)
+    converter.register_structure_hook_func(_is_list, _list_hook(converter))
+    converter.register_structure_hook_func(_is_union, _union_hook(converter))
+    return converter
+
+
+def _number(value: Any, _: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"expected a number (got {_show(value)})")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(f"expected a finite number (got {_show(value)})")
+    return number
+
+
+def _whole(value: Any, _: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"expected a whole number (got {_show(value)})")
+    return value
+
+
+def _text(value: Any, _: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"expected text in quotes (got {_show(value)})")
+    return value
+
+
+def _truth(value: Any, _: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"expected true or false (got {_show(value)})")
+    return value
+
+
+def _show(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _is_list(kind: Any) -> bool:
+    return typing.get_origin(kind) in (list, tuple)
+
+
+def _list_hook(converter: cattrs.Converter) -> Any:
+    """Refuse what iterates but is no array, then leave the elements to cattrs."""
+
+    def hook(value: Any, kind: Any) -> Any:
+        origin, parts = typing.get_origin(kind), typing.get_args(kind)
+        if not isinstance(value, list):
+            raise ValueError(f"expected an array in brackets (got {_show(value)})")
+        if origin is tuple and len(value) != len(parts):
+            raise ValueError(f"expected {len(parts)} values (got {len(value)})")
+        kinds = parts if origin is tuple else parts * len(value)
+        problems: list[Exception] = []
+        made = []
+        for k, (element, part) in enumerate(zip(value, kinds, strict=True)):
+            try:
+                made.append(converter.structure(element, part))
+            except Exception as error:
+                note = IterableValidationNote("", k, part)
+                error.__notes__ = [*getattr(error, "__notes__", []), note]
+                problems.append(error)
+        if problems:
+            raise IterableValidationError("array", problems, kind)
+        return tuple(made) if origin is tuple else made
+
+    return hook
+
+
+def _is_union(kind: Any) -> bool:
+    return typing.get_origin(kind) in (typing.Union, types.UnionType)
+
+
+def _union_hook(converter: cattrs.Converter) -> Any:
+    """Choose the member of a union by the form of the value, so that its errors stay precise."""
+
+    def hook(value: Any, kind: Any) -> Any:
+        members = typing.get_args(kind)
+        if value is None and type(None) in members:
+            return None
+        fitting = [m for m in members if _fits(value, m)]
+        if not fitting:
+            words = " or ".join(dict.fromkeys(w for m in members if (w := _words(m))))
+            raise ValueError(f"expected {words} (got {_show(value)})")
+        return converter.structure(value, fitting[0])
+
+    return hook
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin = typing.get_origin(kind)
+    if origin is typing.Literal:
+        return value in typing.get_args(kind) if isinstance(value, str) else False
+    if origin in (list, tuple):
+        if not isinstance(value, list):
+            return False
+        nested = typing.get_origin(typing.get_args(kind)[0]) is list
+        return nested == bool(value and isinstance(value[0], list))
+    if origin is dict or attrs.has(kind):
+        return isinstance(value, dict)
+    if kind in (float, int):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, kind) if isinstance(kind, type) else False
+
+
+def _words(kind: Any) -> str:
+    origin = typing.get_origin(kind)
+    if kind is type(None):
+        return ""
+    if origin is typing.Literal:
+        return " or ".join(f'"{v}"' for v in typing.get_args(kind))
+    if origin in (list, tuple, dict):
+        return "a table" if origin is dict else "an array"
+    names = {Uniform: "{uniform = [low, high]}", Count: "{count = k}", Port: "a table"}
+    return names.get(kind) or {float: "a number", int: "a whole number", str: "text"}.get(kind, "")
+
+
+# ---- problems with their places -----------------------------------------------------------------
+
+
+def _problems(error: BaseException, place: str) -> list[tuple[str, str]]:
+    if isinstance(error, ClassValidationError | IterableValidationError):
+        found = []
+        for inner in error.exceptions:
+            found += _problems(inner, place + _step(inner))
+        return found
+    if isinstance(error, ForbiddenExtraKeysError):
+        known = [a.name for a in attrs.fields(error.cl)]
+        return [(f"{place}.{key}", _unknown(key, known)) for key in sorted(error.extra_fields)]
+    if isinstance(error, KeyError):
+        return [(f"{place}.{error.args[0]}", "this key is missing")]
+    if isinstance(error, ValueError):
+        return [(place, str(error))]
+    return [(place, f"expected a table (got {error})")]
+
+
+def _step(error: BaseException) -> str:
+    """Return the part of the path that the notes of an error name."""
+    for note in getattr(error, "__notes__", []):
+        if isinstance(note, AttributeValidationNote) and not isinstance(error, KeyError):
+            return f".{note.name}"
+        if isinstance(note, IterableValidationNote):
+            index = note.index
+            return f"[{index}]" if isinstance(index, int) else f".{index}"
+    return ""
+
+
+def _unknown(key: str, known: list[str]) -> str:
+    near = get_close_matches(key, known, 1)
+    hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
+    return f"unknown key; {hint}"

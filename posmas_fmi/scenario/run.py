@@ -1,0 +1,243 @@
+"""One scenario from file to report: design, certify, co-simulate, record, judge."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import platform
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.cosim.master import Outcome, Progress, System, simulate
+from posmas_fmi.cosim.protocol import make_protocol
+from posmas_fmi.cosim.recorder import Layout, Recorder
+from posmas_fmi.design import Design, design
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array
+from posmas_fmi.network import Network
+from posmas_fmi.scenario.build import Scenario, make_channel
+from posmas_fmi.scenario.plant import fmu_files, make_plant
+from posmas_fmi.scenario.verdict import summarise
+
+log = logging.getLogger(__name__)
+
+RECORDED = ("x", "xhat", "u", "sec_u", "y", "s")
+PACKAGES = ("posmas-fmi", "numpy", "scipy", "sympy", "fmpy", "h5netcdf", "h5py")
+
+
+@attrs.frozen(eq=False)
+class RunResult:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    folder : Path
+        With results.nc, design.json, manifest.json, summary.json, report.html.
+    design : Design
+    summary : dict
+        As in summary.json.
+    """
+
+    folder: Path
+    design: Design
+    summary: dict[str, Any]
+
+    @property
+    def good(self) -> bool:
+        """Whether the run converged, stayed non-negative and is certified."""
+        return self.summary["verdict"] == "converged" and self.design.certificate.certified != "no"
+
+
+def make_design_of(scenario: Scenario) -> Design:
+    """Design the gains of a scenario, placing the pins first where it leaves them open.
+
+    Raises
+    ------
+    PosmasError
+        As `posmas_fmi.design.design`.
+    """
+    network = scenario.network
+    if scenario.pins:
+        from posmas_fmi.design.pinning import place_pins
+
+        network = place_pins(network, scenario.pins)
+    return design(scenario.agent, network, scenario.design, scenario.clock.h)
+
+
+def run(
+    scenario: Scenario,
+    folder: Path,
+    progress: Callable[[str], Progress | None] = lambda label: None,
+    command: str = "",
+) -> RunResult:
+    """Run a scenario and write everything to a folder.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    folder : Path
+        Made if needed; files of an earlier run in it are replaced.
+    progress : callable, optional
+        Gets a label, returns a progress function for that part or None.
+    command : str, optional
+        For the manifest.
+
+    Returns
+    -------
+    RunResult
+
+    Raises
+    ------
+    PosmasError
+        If nothing could be run. A run that diverges or whose FMU fails is no error but a verdict,
+        and what was recorded is kept.
+    """
+    from posmas_fmi.report import write_report
+
+    designed = make_design_of(scenario)
+    files = fmu_files(scenario)
+    _make_folder(folder)
+    for name in ("summary.json", "report.html"):
+        (folder / name).unlink(missing_ok=True)
+    _write_json(folder / "design.json", designed.to_dict())
+    _write_json(folder / "manifest.json", manifest(scenario, files, command))
+    began = time.perf_counter()
+    outcome, baseline = _simulate(scenario, designed, files, folder, progress)
+    summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
+    if baseline is not None:
+        without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
+        keys = ("verdict", "tracking_error_final", "min_state")
+        summary["baseline"] = {key: without[key] for key in keys}
+    summary["wall_s"] = round(time.perf_counter() - began, 3)
+    _write_json(folder / "summary.json", summary)
+    write_report(folder)
+    return RunResult(folder, designed, summary)
+
+
+def _simulate(
+    scenario: Scenario,
+    designed: Design,
+    files: list[Path],
+    folder: Path,
+    progress: Callable[[str], Progress | None],
+) -> tuple[Outcome, Outcome | None]:
+    """Run with the design, then once more without control for comparison."""
+    variables = (*RECORDED, "x_baseline") if scenario.baseline else RECORDED
+    with (
+        make_plant(scenario, files) as plant,
+        _recorder(scenario, designed.network, folder / "results.nc", variables) as recorder,
+    ):
+        system = make_system(scenario, designed)
+        outcome = simulate(system, plant, recorder.record, progress("simulate"))
+        recorder.flush()
+        baseline = None
+        if scenario.baseline and outcome.ended in ("complete", "diverged"):
+            baseline = _without_control(scenario, designed, files, recorder, progress)
+        if outcome.ended == "complete":
+            recorder.finish()
+    return outcome, baseline
+
+
+def _without_control(
+    scenario: Scenario,
+    designed: Design,
+    files: list[Path],
+    recorder: Recorder,
+    progress: Callable[[str], Progress | None],
+) -> Outcome:
+    uncontrolled = attrs.evolve(designed, K=np.zeros_like(designed.K))
+    rows = recorder.rows
+
+    def record(t: float, values: dict[str, Array]) -> None:
+        nonlocal rows
+        if rows and "x" in values:  # no further than the run that it is compared with
+            rows -= 1
+            recorder.add({"x_baseline": values["x"]})
+
+    with make_plant(scenario, files) as plant:
+        return simulate(
+            make_system(scenario, uncontrolled), plant, record, progress("without control")
+        )
+
+
+def make_system(scenario: Scenario, designed: Design) -> System:
+    """Put the definition of the co-simulation together."""
+    network = designed.network
+    return System(
+        agent=scenario.agent,
+        network=network,
+        protocol=make_protocol(
+            network,
+            designed.K,
+            designed.E,
+            designed.phi,
+            designed.mu,
+            designed.observer,
+            designed.protocol,
+        ),
+        channel=make_channel(scenario.channel, network, scenario.clock.h),
+        clock=scenario.clock,
+        xhat0=scenario.xhat0,
+        s0=scenario.s0,
+        seed=scenario.settings.seed,
+    )
+
+
+def _recorder(
+    scenario: Scenario, network: Network, path: Path, variables: tuple[str, ...]
+) -> Recorder:
+    agent = scenario.agent
+    layout = Layout(
+        agents=network.names,
+        states=tuple(f"x{k + 1}" for k in range(agent.m)),
+        inputs=tuple(f"u{k + 1}" for k in range(agent.p)),
+        outputs=tuple(f"y{k + 1}" for k in range(agent.q)),
+    )
+    attributes = {
+        "scenario": scenario.name,
+        "period": scenario.clock.h,
+        "created_by": f"posmas-fmi {metadata.version('posmas-fmi')}",
+    }
+    return Recorder(path, layout, network, variables, attributes)
+
+
+def manifest(scenario: Scenario, files: list[Path], command: str) -> dict[str, Any]:
+    """Return what makes the run repeatable: versions, seed, hashes, the scenario itself."""
+    return {
+        "command": command,
+        "scenario": scenario.text,
+        "scenario_sha256": _hash(scenario.text.encode()),
+        "seed": scenario.settings.seed,
+        "period": scenario.clock.h,
+        "until": scenario.clock.time(scenario.clock.steps),
+        "fmus": {path.name: _hash(path.read_bytes()) for path in dict.fromkeys(files)},
+        "inputs": {path.name: _hash(path.read_bytes()) for path in scenario.inputs},
+        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+    }
+
+
+def _hash(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot make the output folder: {error.strerror}; choose another with --out",
+            str(folder),
+        ) from None
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

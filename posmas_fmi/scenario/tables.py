@@ -1,0 +1,196 @@
+"""The tables of a scenario file, as written: one frozen class per TOML table."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import attrs
+
+Matrix = list[list[float]]
+
+
+@attrs.frozen
+class Uniform:
+    """Random initial values, alike likely in ``[low, high]`` = `uniform`, from the seed."""
+
+    uniform: tuple[float, float]
+
+
+@attrs.frozen
+class Count:
+    """How many agents to pin; the design chooses which."""
+
+    count: int
+
+
+@attrs.frozen
+class ScenarioTable:
+    """``[scenario]``: what to run, for how long.
+
+    Attributes
+    ----------
+    name : str
+        Also the name of the output folder.
+    until : float
+        End of the run [s]; a multiple of `period`.
+    period : float
+        Control period = communication step [s].
+    seed : int
+        Of every random number of the run.
+    tolerance : float
+        Largest final error of an agent that counts as converged.
+    """
+
+    name: str
+    until: float
+    period: float
+    seed: int = 0
+    tolerance: float = 1e-2
+
+
+@attrs.frozen
+class AgentTable:
+    """``[agent]``: model (1); see `posmas_fmi.agent.Agent`."""
+
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    H: Matrix | None = None
+    g: list[str] | None = None
+    sec: list[str] | None = None
+    sector: tuple[float, float] = (1.0, 1.0)
+    lipschitz: float | list[float] | None = None
+    region: dict[str, tuple[float, float]] = attrs.field(factory=dict)
+
+
+@attrs.frozen
+class NetworkTable:
+    """``[network]``: who hears whom, and who knows the leader.
+
+    Attributes
+    ----------
+    agents : int, optional
+        Number of agents, with `arcs`.
+    arcs : list of [from, to] or [from, to, weight], optional
+        Agents are numbered from 1; "to" hears "from".
+    file : str, optional
+        ``.csv``, ``.mtx`` or ``.graphml``, instead of `arcs`.
+    pinned : list of int, "auto" or {count = k}
+    names : list of str, optional
+    """
+
+    pinned: list[int] | Literal["auto"] | Count
+    agents: int | None = None
+    arcs: list[list[float]] | None = None
+    file: str | None = None
+    names: list[str] = attrs.field(factory=list)
+
+
+@attrs.frozen
+class Port:
+    """A protocol quantity and the FMU variable that carries it.
+
+    Attributes
+    ----------
+    variable : str
+    scale, offset : float
+        FMU value = scale × protocol value + offset.
+    unit : str, optional
+        The FMU variable's unit, checked against its description.
+    """
+
+    variable: str
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str | None = None
+
+
+@attrs.frozen
+class Override:
+    """``[[plant.override]]``: what is different for one agent (numbered from 1)."""
+
+    agent: int
+    fmu: str | None = None
+    parameters: dict[str, Any] = attrs.field(factory=dict)
+
+
+@attrs.frozen
+class PlantTable:
+    """``[plant]``: the FMU of every agent and its ports.
+
+    Attributes
+    ----------
+    fmu : str
+        Name of a shipped FMU, or a path relative to the scenario file.
+    fmi : int
+        Version of a shipped FMU: 2 or 3.
+    inputs, outputs, states : table
+        ``u1 = "u[1]"`` or ``u1 = {variable = "u[1]", scale = 1.0, offset = 0.0, unit = "W"}``.
+    parameters : table
+        Start values by name.
+    """
+
+    fmu: str = "positive_agent"
+    fmi: int = 3
+    inputs: dict[str, str | Port] | None = None
+    outputs: dict[str, str | Port] | None = None
+    states: dict[str, str | Port] | None = None
+    parameters: dict[str, Any] = attrs.field(factory=dict)
+    override: list[Override] = attrs.field(factory=list)
+
+
+@attrs.frozen
+class LeaderTable:
+    """``[leader]``: its initial state."""
+
+    s0: list[float]
+
+
+@attrs.frozen
+class InitialTable:
+    """``[initial]``: a number, one value per state, one row per agent, or ``{uniform = […]}``."""
+
+    x: float | list[float] | Matrix | Uniform = 0.0
+    xhat: float | list[float] | Matrix | Uniform = 0.0
+
+
+@attrs.frozen
+class ArcTable:
+    """``[[channel.arc]]``: a single arc, by agent numbers from 1; 0 is the leader."""
+
+    arc: tuple[int, int]
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+
+
+@attrs.frozen
+class ChannelTable:
+    """``[channel]``: delay and jitter [s] and loss (probability) of every arc."""
+
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    arc: list[ArcTable] = attrs.field(factory=list)
+
+
+@attrs.frozen
+class ReportTable:
+    """``[report]``: whether the run without control is made as well, for comparison."""
+
+    baseline: bool = True
+
+
+@attrs.frozen
+class ScenarioFile:
+    """A whole scenario file."""
+
+    scenario: ScenarioTable
+    agent: AgentTable
+    network: NetworkTable
+    leader: LeaderTable
+    design: dict[str, Any] = attrs.field(factory=dict)
+    plant: PlantTable = attrs.field(factory=PlantTable)
+    initial: InitialTable = attrs.field(factory=InitialTable)
+    channel: ChannelTable = attrs.field(factory=ChannelTable)
+    report: ReportTable = attrs.field(factory=ReportTable)

@@ -1,0 +1,77 @@
+"""The verdict on a run: per agent and for the network, as it stands in summary.json."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from posmas_fmi.cosim.master import Outcome
+
+NEGATIVE = -1e-9  # a state above this counts as non-negative: the noise of the integration
+
+
+def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dict[str, Any]:
+    """Return the content of summary.json but for the wall time.
+
+    Parameters
+    ----------
+    outcome : Outcome
+    names : tuple of str
+        Of the agents.
+    tolerance : float
+        Largest final tracking error that counts as converged.
+
+    Returns
+    -------
+    dict
+        ``verdict`` is one of ``converged``, ``not converged``, ``positivity lost``, ``diverged``,
+        ``failed``, ``cancelled``.
+    """
+    agents = [
+        {
+            "name": name,
+            "status": _status(outcome, k, name, tolerance),
+            "final_error": _finite(outcome.tracking_error[k]),
+            "min_state": _finite(outcome.min_state[k]),
+            "min_time": _finite(outcome.min_time[k]),
+        }
+        for k, name in enumerate(names)
+    ]
+    return {
+        "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
+        "reason": outcome.reason,
+        "agents": agents,
+        "tracking_error_final": _finite(outcome.tracking_error.max()),
+        "estimation_error_final": _finite(outcome.estimation_error.max()),
+        "min_state": _finite(outcome.min_state.min()),
+        "steps": outcome.steps,
+        "time": outcome.time,
+        "messages_sent": outcome.messages,
+        "messages_lost": outcome.lost,
+    }
+
+
+def _status(outcome: Outcome, k: int, name: str, tolerance: float) -> str:
+    error = outcome.tracking_error[k]
+    if outcome.ended == "diverged" or not math.isfinite(error):
+        return "diverged"
+    if outcome.ended == "failed" and outcome.failed_agent == name:
+        return "failed"
+    if outcome.min_state[k] < NEGATIVE:
+        return "positivity lost"
+    return "converged" if error <= tolerance else "not converged"
+
+
+def _verdict(outcome: Outcome, statuses: list[str]) -> str:
+    if outcome.ended in ("diverged", "failed", "cancelled"):
+        return outcome.ended
+    for status in ("diverged", "positivity lost", "not converged"):
+        if status in statuses:
+            return status
+    return "converged"
+
+
+def _finite(value: Any) -> float | None:
+    """JSON has no NaN and no infinity."""
+    number = float(value)
+    return number if math.isfinite(number) else None
