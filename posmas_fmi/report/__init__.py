@@ -37,8 +37,8 @@ def write_report(folder: Path) -> Path:
         ...
     posmas_fmi.errors.InputError: no-such-run: expected the folder of a run (there is none); ...
     """
-    from posmas_fmi.report.data import read_run
     from posmas_fmi.report.page import render
+    from posmas_fmi.report.reading import read_run
 
     page = render(read_run(folder))
     path = folder / "report.html"

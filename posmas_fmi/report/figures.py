@@ -9,7 +9,17 @@ import numpy as np
 
 from posmas_fmi.expression import Array
 from posmas_fmi.report.data import Run
-from posmas_fmi.report.svg import BLACK, BLUE, CYCLE, GREY, SKY, VERMILION, look, to_svg
+from posmas_fmi.report.svg import (
+    BLACK,
+    BLUE,
+    CYCLE,
+    GREY,
+    SKY,
+    VERMILION,
+    look,
+    power_of_ten,
+    to_svg,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,12 +27,13 @@ if TYPE_CHECKING:
 
 MOST_LINES = 12  # agents up to which each has a line of its own; beyond, bands
 MOST_POINTS = 700  # per line: about two per pixel
+LEAST = 0.1  # part of the agents that the bands of a logarithmic plot leave out: they cross zero
 PANEL = (5.0, 2.75)  # inches
 DASHES = ("solid", (0, (4.0, 1.4)))
 
 # A plot cannot show more; far beyond it matplotlib's transforms overflow.
 LARGEST_SHOWN = 1e60
-FLOOR = 1e-16  # of the largest value, under which a logarithmic plot shows rounding only
+FLOOR = 1e-16  # of the first error, under which a logarithmic plot shows rounding only
 
 
 def line_look(i: int) -> tuple[str, str]:
@@ -90,7 +101,7 @@ def error_panel(
         label = f"|{symbol}{index_of(k, run.m)}|"
         figure, axes = _panel(run, label, run.units.get("x", ""))
         modulus = np.abs(error[:, :, k])
-        _agents(axes, run, modulus)
+        _agents(axes, run, modulus, least=LEAST)
         _guide(axes, run, modulus, rate)
         _log(axes, modulus)
         _mark_loss(axes, run)
@@ -128,26 +139,13 @@ def sector_panel(run: Run, k: int, name: str, alt: str) -> str:
         u, force = run.u[:, :, k].ravel(), run.sec_u[:, :, k].ravel()
         finite = np.isfinite(u) & np.isfinite(force)
         u, force = np.clip([u[finite], force[finite]], -LARGEST_SHOWN, LARGEST_SHOWN)
-        order = np.argsort(u, kind="stable")
-        chosen = order[np.unique(np.linspace(0, len(order) - 1, 500).astype(int))] if u.size else order
+        chosen = _spread(u)
         reach = 1.08 * max(_largest(u), 1e-12)
         wide = reach > 1e6
         grid = np.geomspace(1e-3, reach, 120) if wide else np.array([0.0, reach])
         grid = np.concatenate([-grid[::-1], grid])
         if run.design.sector is not None:
-            low, high = run.design.sector
-            axes.fill_between(grid, low * grid, high * grid, color=SKY, alpha=0.3, lw=0)
-            for slope, text in ((low, "m_l"), (high, "m_h")):
-                axes.plot(grid, slope * grid, color=BLUE, lw=0.9, ls=(0, (5, 2)))
-                axes.annotate(
-                    f"{text} = {slope:g}",
-                    (0.97 * reach, slope * 0.97 * reach),
-                    (-4, -3 if slope == low else 3),
-                    textcoords="offset points",
-                    ha="right",
-                    va="top" if slope == low else "bottom",
-                    color=BLUE,
-                )
+            _cone(axes, grid, *run.design.sector, wide)
         axes.plot(u[chosen], force[chosen], ls="none", marker=".", ms=4, mew=0, color=VERMILION)
         if wide:
             _symlog(axes, 1.0)
@@ -208,30 +206,32 @@ def _largest(values: Array) -> float:
     return float(min(finite.max(initial=0.0), LARGEST_SHOWN))
 
 
-def _agents(axes: Axes, run: Run, values: Array) -> None:
-    """Draw one line per agent, or bands when there are too many; ``values`` is (T, N)."""
+def _agents(axes: Axes, run: Run, values: Array, least: float = 0.0) -> None:
+    """Draw one line per agent, or bands when there are too many.
+
+    ``values`` is (T, N); the bands leave out the fraction ``least`` of the smallest values.
+    """
     if run.N > MOST_LINES:
-        _bands(axes, run, values)
+        _bands(axes, run, values, least)
         return
     for i in range(run.N):
         colour, dash = line_look(i)
         time, line = _thin(run.time, values[:, i])
-        style = {"color": colour, "ls": DASHES[dash == "dashed"]}
-        axes.plot(time, line, **style, marker="." if len(run.time) < 3 else None)
-        lost = run.lost_at[i]
+        marker = "." if len(run.time) < 3 else None
+        axes.plot(time, line, color=colour, ls=DASHES[dash == "dashed"], marker=marker)
         ends = np.flatnonzero(np.isfinite(line))
-        if np.isfinite(lost) and ends.size:
-            axes.plot(time[ends[-1]], line[ends[-1]], marker="X", ms=6, color=colour, clip_on=False)
+        if ends.size and not np.isfinite(values[-1, i]):
+            axes.plot(time[ends[-1]], line[ends[-1]], marker="X", ms=6, color=colour)
 
 
-def _bands(axes: Axes, run: Run, values: Array) -> None:
+def _bands(axes: Axes, run: Run, values: Array, least: float) -> None:
     """Draw all agents, the middle half, the median, and the agent with the largest final error."""
-    index = np.unique(np.linspace(0, len(run.time) - 1, 400).astype(int)) if len(run.time) else []
+    index = np.unique(np.linspace(0, len(run.time) - 1, 400).astype(int))
     time, rows = run.time[index], _shown(values[index])
     seen = np.isfinite(rows).any(axis=1)
     time, rows = time[seen], rows[seen]
     if time.size:
-        low, q1, median, q3, high = np.nanquantile(rows, (0, 0.25, 0.5, 0.75, 1), axis=1)
+        low, q1, median, q3, high = np.nanquantile(rows, (least, 0.25, 0.5, 0.75, 1), axis=1)
         axes.fill_between(time, low, high, color=SKY, alpha=0.28, lw=0)
         axes.fill_between(time, q1, q3, color=BLUE, alpha=0.35, lw=0)
         axes.plot(time, median, color=BLUE)
@@ -265,6 +265,32 @@ def _thin(time: Array, values: Array) -> tuple[Array, Array]:
     return time[index], values[index]
 
 
+def _cone(axes: Axes, grid: Array, low: float, high: float, wide: bool) -> None:
+    axes.fill_between(grid, low * grid, high * grid, color=SKY, alpha=0.3, lw=0)
+    for slope in (low, high):
+        axes.plot(grid, slope * grid, color=BLUE, lw=0.9, ls=(0, (5, 2)))
+    at = 0.62 * grid[-1]
+    labels = [
+        (f"m_l = {low:g}", low, (7, -2), "left", "top"),
+        (f"m_h = {high:g}", high, (-7, 2), "right", "bottom"),
+    ]
+    if wide:  # the two lines are one on a logarithmic scale
+        labels = [(f"m_l = {low:g}, m_h = {high:g}", high, (-24, 4), "right", "center")]
+    for text, slope, offset, ha, va in labels:
+        axes.annotate(text, (at, slope * at), offset, textcoords="offset points", ha=ha, va=va,
+                      color=BLUE)  # fmt: skip
+
+
+def _spread(u: Array) -> Array:
+    """Choose samples that show where inputs are often and how far they reach."""
+    if not u.size:
+        return np.empty(0, dtype=int)
+    order = np.argsort(u, kind="stable")
+    often = np.linspace(0, u.size - 1, 250).astype(int)
+    far = np.searchsorted(u[order], np.linspace(u.min(), u.max(), 250)).clip(max=u.size - 1)
+    return np.asarray(order[np.unique(np.concatenate([often, far]))])
+
+
 def _guide(axes: Axes, run: Run, modulus: Array, rate: float | None) -> None:
     """Draw the slope of the proved rate, starting from the largest first value."""
     first = modulus[0][np.isfinite(modulus[0])] if len(modulus) else np.empty(0)
@@ -273,16 +299,6 @@ def _guide(axes: Axes, run: Run, modulus: Array, rate: float | None) -> None:
     time = np.array([run.time[0], run.time[-1]])
     line = first.max() * np.exp(-np.minimum(rate * (time - time[0]), 600.0))
     axes.plot(time, line, color=GREY, lw=1.0, ls=(0, (6, 3)), zorder=1.5)
-    axes.annotate(
-        f"slope of the proved rate {rate:.3g} 1/s",
-        (time[-1], line[-1]),
-        (-2, 4),
-        textcoords="offset points",
-        ha="right",
-        va="bottom",
-        color="#4b5563",
-        fontsize=8,
-    )
 
 
 def _log(axes: Axes, modulus: Array) -> None:
@@ -291,7 +307,9 @@ def _log(axes: Axes, modulus: Array) -> None:
         axes.text(0.5, 0.5, "zero throughout", transform=axes.transAxes, ha="center", color=GREY)
         return
     top = min(float(finite.max()), LARGEST_SHOWN)
-    bottom = max(float(finite.min()), FLOOR * top, 1e-300)
+    first = modulus[0][np.isfinite(modulus[0])].max(initial=0.0)
+    rounding = FLOOR * (min(float(first), top) or top)
+    bottom = max(float(finite.min()), rounding, 1e-300)
     axes.set_yscale("log", nonpositive="mask")
     axes.set_ylim(bottom / 2, top * 3)
     _decades(axes.yaxis)
@@ -314,7 +332,8 @@ def _decades(axis: object) -> None:
     if linear:
         first, last = math.log10(linear), math.log10(max(abs(low), abs(high), 10 * linear))
         step = max(1, math.ceil((last - first) / 3))
-        powers = 10.0 ** np.arange(first, last + 1e-9, step)
+        crowded = last - first > 3  # the threshold would touch the zero
+        powers = 10.0 ** np.arange(first + step * crowded, last + 1e-9, step)
         both = np.concatenate([-powers[::-1], [0.0], powers])
         ticks = [t for t in both if low <= t <= high]
     elif low > 0:
@@ -322,17 +341,7 @@ def _decades(axis: object) -> None:
         ticks = [10.0**e for e in range(first, last + 1, max(1, math.ceil((last - first) / 6)))]
     axis.set_major_locator(FixedLocator(ticks))  # type: ignore[attr-defined]
     axis.set_minor_locator(NullLocator())  # type: ignore[attr-defined]
-    axis.set_major_formatter(FuncFormatter(_power_of_ten))  # type: ignore[attr-defined]
-
-
-def _power_of_ten(value: float, _position: int) -> str:
-    if value == 0:
-        return "0"
-    exponent = round(math.log10(abs(value)))
-    sign = "−" if value < 0 else ""
-    if -1 <= exponent <= 2:
-        return f"{sign}{10.0**exponent:g}"
-    return f"{sign}10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    axis.set_major_formatter(FuncFormatter(power_of_ten))  # type: ignore[attr-defined]
 
 
 def _mark_loss(axes: Axes, run: Run) -> None:
@@ -351,4 +360,6 @@ def _mark_loss(axes: Axes, run: Run) -> None:
         va="top",
         color="#a34700",
         fontsize=8,
+        bbox={"fc": "white", "ec": "none", "pad": 1.0, "alpha": 0.85},
+        zorder=5,
     )

@@ -12,12 +12,13 @@ import scipy.sparse.csgraph as csgraph
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 from posmas_fmi.report.data import Run
-from posmas_fmi.report.svg import BLACK, BLUE, GREY, VERMILION, look, to_svg
+from posmas_fmi.report.svg import BLACK, BLUE, GREY, VERMILION, look, power_of_ten, to_svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+FEW_NODES = 12  # agents up to which the drawing stands beside the table
 MOST_NODES = 60  # agents up to which the digraph itself is drawn
 MOST_DOTS = 4000  # arcs up to which each is a dot in the adjacency; beyond, cells are counted
 CELLS = 120
@@ -26,30 +27,34 @@ COLOURS = "cividis_r"  # even to readers with any colour vision; dark is a large
 
 @attrs.frozen
 class _Scale:
-    """Colours for final errors, logarithmic."""
+    """Colours for final errors: logarithmic, from the largest error at the start downwards."""
 
-    low: float
     high: float
+    decades: int = 6
+
+    @property
+    def low(self) -> float:
+        return self.high * 10.0**-self.decades
+
+    def exceeded(self, error: float) -> bool:
+        """Whether an error is far larger than what the run started with."""
+        return not error <= 10 * self.high  # NaN as well
 
     def __call__(self, error: float) -> tuple[Any, str]:
         """Return the fill and a text colour readable on it."""
         import matplotlib
 
-        if not math.isfinite(error):
+        if self.exceeded(error):
             return VERMILION, "white"
-        span = math.log10(self.high / self.low)
-        part = math.log10(min(max(error, self.low), self.high) / self.low) / span
+        part = 1 + math.log10(min(max(error, self.low), self.high) / self.high) / self.decades
         r, g, b, _ = matplotlib.colormaps[COLOURS](part)
         return (r, g, b), "white" if 0.299 * r + 0.587 * g + 0.114 * b < 0.55 else BLACK
 
 
-def _scale(errors: Array) -> _Scale:
-    """At least three decades, so that equal errors do not look like opposites."""
-    positive = errors[np.isfinite(errors) & (errors > 0)]
-    high = float(positive.max()) if positive.size else 1.0
-    low = max(float(positive.min()), 1e-12 * high) if positive.size else 1e-3
-    top = 10.0 ** math.ceil(math.log10(min(max(high, 1e-290), 1e290)))
-    return _Scale(min(10.0 ** math.floor(math.log10(max(low, 1e-300))), 1e-3 * top), top)
+def _scale(run: Run) -> _Scale:
+    first = np.abs(run.tracking_error[:1])
+    largest = float(first[np.isfinite(first)].max(initial=0.0)) or 1.0
+    return _Scale(10.0 ** math.ceil(math.log10(min(max(largest, 1e-200), 1e200)) - 1e-9))
 
 
 def network_figure(run: Run, name: str, alt: str) -> str:
@@ -71,8 +76,13 @@ def network_figure(run: Run, name: str, alt: str) -> str:
         return to_svg(figure, name, alt)
 
 
+def names_fit(run: Run) -> bool:
+    """Whether the nodes can carry the names of the agents; else they carry numbers from 1."""
+    return all(len(name) <= 3 for name in run.names)
+
+
 def hops(network: Network) -> Array:
-    """Return the fewest arcs from the leader to each agent, (N,): 1 for a pinned agent, inf if unreached."""
+    """Return the fewest arcs from the leader to each agent, (N,): infinite if unreached."""
     pinned = list(network.pinned)
     if not pinned:
         return np.full(network.N, np.inf)
@@ -123,23 +133,25 @@ def _digraph(run: Run) -> Figure:
     network, xy = run.network, layout(run.network)
     n = network.N
     spread = np.ptp(xy, axis=0)
-    width = 6.4
+    width = 5.2 if n <= FEW_NODES else 7.4
+    foot = 0.75  # of the colour scale
     xy = xy * (width - 1.3) / max(spread[0], 1e-9)  # now in inches
     radius = min(0.24, 0.36 * _nearest(xy))
-    height = float(np.clip(np.ptp(xy[:, 1]) + 4 * radius, 1.6, 5.2)) + 0.75
-    figure = Figure(figsize=(width, height), layout="none")
-    axes = figure.add_axes((0.0, 0.75 / height, 1.0, 1.0 - 0.75 / height))
+    height = float(np.clip(np.ptp(xy[:, 1]) + 4 * radius, 1.6, 5.2)) + foot
+    figure = Figure(figsize=(width, height))
+    figure.set_layout_engine("none")
+    axes = figure.add_axes((0.0, foot / height, 1.0, 1.0 - foot / height))
     axes.set_axis_off()
     axes.set_aspect("equal")
     middle = 0.5 * (xy.max(axis=0) + xy.min(axis=0))
     axes.set_xlim(middle[0] - width / 2, middle[0] + width / 2)
-    reach = (height - 0.75) / 2
+    reach = (height - foot) / 2
     half = max(reach, np.ptp(xy[:, 1]) / 2 + 2 * radius)
     axes.set_ylim(middle[1] - half, middle[1] + half)
 
     adjacency = network.adjacency.tocoo()
     both = set(zip(adjacency.row.tolist(), adjacency.col.tolist(), strict=True))
-    shrink = 72 * radius + 2
+    rim = 72 * radius * np.where(np.append(network.pinning, 1.0) > 0, 1.28, 1.0) + 2  # points
     arcs = [(j, i, False) for i, j in sorted(both)] + [(n, i, True) for i in network.pinned]
     for source, target, pin in arcs:
         bend = 0.18 if (source, target) in both and (target, source) in both else 0.0
@@ -152,13 +164,13 @@ def _digraph(run: Run) -> Figure:
                 arrowstyle="-|>,head_length=0.5,head_width=0.22",
                 mutation_scale=9 if n <= 30 else 6,
                 connectionstyle=f"arc3,rad={bend}",
-                shrinkA=shrink,
-                shrinkB=shrink,
+                shrinkA=float(rim[source]),
+                shrinkB=float(rim[target]),
                 lw=1.8 if pin else 0.9,
                 color=BLUE if pin else "#7c8594",
             )
         )
-    scale = _scale(run.final_error)
+    scale = _scale(run)
     _nodes(axes, run, xy, radius, scale)
     _key(figure, run, scale, height)
     return figure
@@ -180,7 +192,7 @@ def _nodes(axes: Axes, run: Run, xy: Array, radius: float, scale: _Scale) -> Non
     from matplotlib.patches import Circle, RegularPolygon
 
     n = run.N
-    fits = all(len(name) <= 3 for name in run.names)
+    fits = names_fit(run)
     size = min(10.0, 62 * radius)
     for i in range(n):
         fill, ink = scale(run.final_error[i])
@@ -188,9 +200,13 @@ def _nodes(axes: Axes, run: Run, xy: Array, radius: float, scale: _Scale) -> Non
             axes.add_patch(Circle(tuple(xy[i]), 1.28 * radius, fc="white", ec=BLUE, lw=1.8))
         axes.add_patch(Circle(tuple(xy[i]), radius, fc=fill, ec=BLACK, lw=0.8))
         label = run.names[i] if fits else str(i + 1)
-        axes.text(*xy[i], label, color=ink, ha="center", va="center_baseline", fontsize=size)
+        axes.text(
+            xy[i, 0], xy[i, 1], label, color=ink, ha="center", va="center_baseline", fontsize=size
+        )
     axes.add_patch(RegularPolygon(tuple(xy[n]), 4, radius=1.25 * radius, fc=BLACK, ec=BLACK))
-    axes.text(*xy[n], "s", color="white", ha="center", va="center_baseline", fontsize=size)
+    axes.text(
+        xy[n, 0], xy[n, 1], "s", color="white", ha="center", va="center_baseline", fontsize=size
+    )
 
 
 def _key(figure: Figure, run: Run, scale: _Scale, height: float) -> None:
@@ -202,17 +218,20 @@ def _key(figure: Figure, run: Run, scale: _Scale, height: float) -> None:
     for k in range(steps):
         part = (k + 0.5) / steps
         fill, _ = scale(scale.low * (scale.high / scale.low) ** part)
-        axes.add_patch(Rectangle((k / steps, 0), 1.02 / steps, 1, fc=fill, lw=0))
+        axes.add_patch(Rectangle((k / steps, 0), 1.6 / steps, 1, fc=fill, lw=0))
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1)
     axes.set_yticks([])
     axes.grid(False)
     axes.spines[:].set_visible(False)
-    axes.set_xticks([0, 1], [f"≤ {scale.low:.0e}", f"{scale.high:.0e}"])
+    axes.set_xticks(
+        [0, 1], [f"≤ {power_of_ten(scale.low)}", f"{power_of_ten(scale.high)}, as at the start"]
+    )
     axes.tick_params(length=0, pad=2)
     what = "|x − s|" if run.x is not None else "|x̂ − s|"
-    lost = " (vermilion: not finite)" if not np.isfinite(run.final_error).all() else ""
-    axes.set_title(f"final error {what}{lost}", loc="center", fontweight="normal", pad=3)
+    beyond = any(scale.exceeded(e) for e in run.final_error)
+    more = "; vermilion: larger than at the start" if beyond else ""
+    axes.set_title(f"final error {what}{more}", loc="center", fontweight="normal", pad=3)
 
 
 def _summary(run: Run) -> Figure:
@@ -260,11 +279,12 @@ def _summary(run: Run) -> Figure:
         from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
         right.yaxis.set_major_locator(LogLocator(numticks=7))
-        right.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:.0e}"))
+        right.yaxis.set_major_formatter(FuncFormatter(power_of_ten))
         right.yaxis.set_minor_locator(NullLocator())
     if lost.any():
-        right.plot(across[lost], np.full(lost.sum(), 0.97), ls="none", marker="X", ms=5, mew=0,
-                   color=VERMILION, transform=right.get_xaxis_transform(), label="lost")  # fmt: skip
+        top = np.full(lost.sum(), 0.97)
+        right.plot(across[lost], top, ls="none", marker="X", ms=5, mew=0, color=VERMILION,
+                   transform=right.get_xaxis_transform(), label="lost")  # fmt: skip
     right.set_xlabel("arcs from the leader" if profile is None else "p: how far the leader is")
     right.set_ylabel("final error" + (" |x − s|" if run.x is not None else " |x̂ − s|"))
     right.set_title("Final error against distance")

@@ -12,14 +12,14 @@ import numpy as np
 from posmas_fmi.expression import Array
 from posmas_fmi.report import figures, wording
 from posmas_fmi.report.data import Run
-from posmas_fmi.report.network_drawing import MOST_NODES, network_figure
+from posmas_fmi.report.network_drawing import FEW_NODES, MOST_NODES, names_fit, network_figure
+from posmas_fmi.report.svg import BLACK, BLUE, SKY, VERMILION
 from posmas_fmi.report.wording import show
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
 MOST_STATES = 6  # components of which each gets a plot of its own
-MOST_ROWS = 12  # agents shown before the table folds
 MOST_HEARD = 8  # names listed in one cell
 
 
@@ -38,6 +38,7 @@ class Figure:
 class AgentRow:
     """One line of the table of agents."""
 
+    number: int
     name: str
     pinned: bool
     hears: str
@@ -87,9 +88,10 @@ def render(run: Run) -> str:
         tiles=wording.tiles(run),
         network=_network(run),
         reduced_network=run.N > MOST_NODES,
-        names_drawn=all(len(name) <= 3 for name in run.names) or run.N > MOST_NODES,
+        numbered=run.N <= MOST_NODES and not names_fit(run),
+        beside=run.N <= FEW_NODES and all(len(name) <= 12 for name in run.names),
         agents=_agent_rows(run),
-        most_rows=MOST_ROWS,
+        most_rows=FEW_NODES,
         legend=_legend(run),
         panels=_panels(run) if run.time.size else (),
         inputs=_inputs(run) if run.time.size else (),
@@ -114,7 +116,7 @@ def _network(run: Run) -> Markup:
 def _agent_rows(run: Run) -> list[AgentRow]:
     """Worst first where the table folds, else in the order of the network."""
     order = np.arange(run.N)
-    if run.N > MOST_ROWS:
+    if run.N > FEW_NODES:
         error = np.where(np.isfinite(run.final_error), run.final_error, np.inf)
         order = np.argsort(-error, kind="stable")
     verdicts = run.summary.agents if len(run.summary.agents) == run.N else None
@@ -127,34 +129,39 @@ def _agent_rows(run: Run) -> list[AgentRow]:
         more = [f"{len(heard) - MOST_HEARD} more"] if len(heard) > MOST_HEARD else []
         rows.append(
             AgentRow(
+                number=i + 1,
                 name=run.names[i],
                 pinned=bool(run.network.pinning[i] > 0),
                 hears=", ".join([*names, *more]),
                 p=show(None if run.p_profile is None else float(run.p_profile[i])),
                 status=verdicts[i].status if verdicts else "",
-                final_error=show(float(run.final_error[i])),
-                estimation_error=(
-                    show(float(np.abs(estimation[-1, i]).max()))
-                    if estimation is not None and run.time.size
-                    else "–"
-                ),
+                final_error=_last_error(run.tracking_error, i),
+                estimation_error=_last_error(estimation, i),
                 lost_at=show(float(run.lost_at[i])) if np.isfinite(run.lost_at[i]) else "",
             )
         )
     return rows
 
 
+def _last_error(error: Array | None, i: int) -> str:
+    """Return the largest modulus of the last error of agent i; a dash where it is not known."""
+    if error is None or not len(error) or np.isnan(error[:, i]).all():
+        return "–"
+    last = float(np.abs(error[-1, i]).max())
+    return show(last) if np.isfinite(last) else "not finite"
+
+
 def _legend(run: Run) -> list[Key]:
     if run.N > figures.MOST_LINES:
         keys = [
-            Key("all agents", figures.SKY, "solid", patch=True),
-            Key("middle half", figures.BLUE, "solid", patch=True),
-            Key("median", figures.BLUE, "solid"),
-            Key(f"agent {run.names[run.worst]} (largest final error)", figures.VERMILION, "solid"),
+            Key("all agents", SKY, "solid", patch=True),
+            Key("middle half", BLUE, "solid", patch=True),
+            Key("median", BLUE, "solid"),
+            Key(f"agent {run.names[run.worst]} (largest final error)", VERMILION, "solid"),
         ]
     else:
         keys = [Key(f"agent {name}", *figures.line_look(i)) for i, name in enumerate(run.names)]
-    return [*keys, Key("leader s", figures.BLACK, "dotted")]
+    return [*keys, Key("leader s", BLACK, "dotted")]
 
 
 def _panels(run: Run) -> tuple[Figure, ...]:
@@ -200,10 +207,21 @@ def _panels(run: Run) -> tuple[Figure, ...]:
         "b", "Observer states", "The estimates x̂ of the same states, against the leader.",
         states(run.xhat, "x̂", "xhat", "Observer states"),
     )  # fmt: skip
-    logarithmic = "Modulus on a logarithmic scale; a dip is a change of sign, a straight line an exponential."
+    scale = "Modulus, logarithmic: a dip is a change of sign, a straight line an exponential."
+    if run.N > figures.MOST_LINES:
+        scale += (
+            f" The palest band leaves out the smallest {100 * figures.LEAST:.0f} %, "
+            "which are crossing zero."
+        )
+
+    def with_slope(rate: float | None) -> str:
+        if rate is None or not rate > 0:
+            return scale
+        return f"{scale} Grey, dashed: the slope of the proved rate, {show(rate)} 1/s."
+
     if run.estimation_error is not None:
         c = Figure(
-            "c", "Estimation error e = x − x̂", logarithmic,
+            "c", "Estimation error e = x − x̂", with_slope(design.observer_rate),
             errors(run.estimation_error, "e", design.observer_rate, "e", "Estimation error"),
         )  # fmt: skip
     else:
@@ -213,7 +231,7 @@ def _panels(run: Run) -> tuple[Figure, ...]:
         )  # fmt: skip
     symbol = "x − s" if run.x is not None else "x̂ − s"
     d = Figure(
-        "d", f"Consensus error δ = {symbol}", logarithmic,
+        "d", f"Consensus error δ = {symbol}", with_slope(together),
         errors(run.tracking_error, "δ", together, "delta", "Consensus error"),
     )  # fmt: skip
     return (a, b, c, d)
@@ -280,5 +298,3 @@ def _flat(content: Mapping[str, Any], place: str = "") -> list[tuple[str, str]]:
 
 def _long_texts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(k, v) for k, v in content.items() if isinstance(v, str) and "\n" in v]
-
-

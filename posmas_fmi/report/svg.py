@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 SKY, ORANGE, BLACK, GREY = "#56b4e9", "#e69f00", "#1a1a1a", "#6b7280"
 CYCLE = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILION)
 
-_STYLE = {
+_STYLE: dict[str, Any] = {
     "svg.fonttype": "none",  # text stays text: searchable, and set in the font of the page
     "svg.hashsalt": "posmas-fmi",
     "text.parse_math": False,  # names of agents may contain a dollar sign
@@ -60,15 +61,32 @@ _REFERENCE = re.compile(r"#([A-Za-z_][\w.-]*)")
 
 @contextlib.contextmanager
 def look() -> Iterator[None]:
-    """Draw and save inside this context: neither reads nor leaves a trace in the user's settings."""
+    """Draw and save in here: neither reads nor changes the settings of the user."""
     import matplotlib
 
     with matplotlib.rc_context(), warnings.catch_warnings():
         # a name in a script that the measuring font lacks is still set in the reader's font
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
+        matplotlib.rcParams.update(_STYLE)  # type: ignore[arg-type, unused-ignore]
         yield
+
+
+def power_of_ten(value: float, _position: int = 0) -> str:
+    """Write a power of ten without mathtext, as a matplotlib tick formatter.
+
+    Examples
+    --------
+    >>> power_of_ten(1e-5), power_of_ten(-100.0), power_of_ten(0.0)
+    ('10⁻⁵', '−100', '0')
+    """
+    if value == 0:
+        return "0"
+    exponent = round(math.log10(abs(value)))
+    sign = "−" if value < 0 else ""
+    if -1 <= exponent <= 2:
+        return f"{sign}{10.0**exponent:g}"
+    return f"{sign}10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def to_svg(figure: Figure, name: str, alt: str) -> str:
@@ -110,7 +128,7 @@ def to_svg(figure: Figure, name: str, alt: str) -> str:
 
 
 def _strip(root: ElementTree.Element) -> None:
-    """Drop namespaces (HTML knows the SVG names), styles that would leak into the page, metadata."""
+    """Drop namespaces (HTML knows SVG), styles that would leak into the page, and metadata."""
     for element in root.iter():
         element.tag = element.tag.removeprefix(_SVG)
         for key in list(element.attrib):

@@ -70,14 +70,16 @@ def _outcome(run: Run) -> str:
         where = ""
         if run.first_lost:
             agent, time = run.first_lost
-            where = f", agent {run.names[agent]} is lost from t = {show(time)} s"
+            where = f" (agent {run.names[agent]} is lost from t = {show(time)} s)"
         text = f"the closed loop diverged{where}"
     elif verdict == "converged":
-        text = f"{_everyone(run)} reached the leader, within {error} at {at}"
+        close = f"to within {error}" if run.summary.tracking_error else "to the last digit"
+        judge = ", as far as the observers tell" if run.x is None else ""
+        text = f"{_everyone(run)} reached the leader, {close} at {at}{judge}"
     elif verdict == "cut off":
         text = f"the largest tracking error was {error} by then"
     else:
-        text = f"{verdict}, the largest tracking error is {error} at {at}"
+        text = f"{verdict}: the largest tracking error is {error} at {at}"
     return cut + text if cut else text[:1].upper() + text[1:]
 
 
@@ -90,6 +92,9 @@ def _positivity(run: Run) -> str:
     return ", and no state became negative"
 
 
+_DOUBT = {"contradicted": "which the model contradicts", "declared": "declared, not proved"}
+
+
 def _proof(run: Run) -> str:
     design = run.design
     what = "convergence is proved"
@@ -99,9 +104,7 @@ def _proof(run: Run) -> str:
         return f"{what} without further conditions"
     if design.certified == "conditional":
         parts = [
-            f"“{a.name}” ({'which the model contradicts' if a.status == 'contradicted' else 'declared, not proved'})"
-            for a in design.assumptions
-            if a.status != "verified"
+            f"“{a.name}” ({_DOUBT[a.status]})" for a in design.assumptions if a.status != "verified"
         ]
         return f"{what} only on condition of {join(parts)}" if parts else f"{what} conditionally"
     failing = [f"“{c.name}”" for c in design.conditions if not c.holds]
@@ -112,7 +115,7 @@ def _proof(run: Run) -> str:
 
 
 def advice(run: Run) -> str:
-    """What to do next."""
+    """Say what to do next."""
     design = run.design
     if run.summary.verdict == "diverged" or run.first_lost:
         if design.protocol == "printed":
@@ -137,14 +140,14 @@ def advice(run: Run) -> str:
         worst = [a for a in design.assumptions if a.status == "contradicted"]
         if worst:
             return (
-                f"Before relying on the proof, restrict the region or the model so that "
-                f"{join([f'“{a.name}”' for a in worst])} is true; as declared, it is false somewhere "
-                "on the stated region."
+                "Before relying on the proof, restrict the region or the model so that "
+                f"{join([f'“{a.name}”' for a in worst])} is true; as declared, it is false "
+                "somewhere on the stated region."
             )
         return "The proof is as good as the declared assumptions: have them checked for your plant."
     if run.summary.verdict != "converged":
         return "The proof covers the limit; simulate longer, or ask for a faster rate."
-    return "The gains can be exported as they are: the certificate covers the sampled loop that was run."
+    return "The gains can be used as they are: the certificate covers the sampled loop that ran."
 
 
 def tiles(run: Run) -> list[tuple[str, str, str, str]]:
@@ -159,14 +162,16 @@ def tiles(run: Run) -> list[tuple[str, str, str, str]]:
         "yes": f"{len(design.conditions)} conditions hold, every assumption verified",
         "conditional": f"{len(design.conditions)} conditions hold, {open_count} assumption"
         f"{'s' * (open_count != 1)} not verified",
-        "no": f"{failing} of {len(design.conditions)} conditions failed",
+        "no": f"{failing} of {len(design.conditions)} conditions failed"
+        if failing
+        else "there is no complete proof",
     }
     end = f"at t = {show(run.until)} s" if run.time.size else "no samples"
     return [
         (
             "Tracking",
             "diverged" if diverged else summary.verdict,
-            f"largest error {show(summary.tracking_error)} {end}",
+            f"largest error {_size(summary.tracking_error, diverged)} {end}",
             "bad" if diverged else "good" if summary.verdict == "converged" else "caution",
         ),
         (
@@ -180,8 +185,14 @@ def tiles(run: Run) -> list[tuple[str, str, str, str]]:
             "unknown" if lowest is None else "lost" if negative(run) else "kept",
             "the plant does not show its states"
             if lowest is None
-            else f"lowest state {show(lowest)}; "
-            + ("proved for observers that start low" if design.positive else "not proved"),
+            else f"lowest state {show(lowest)}"
+            + (
+                ", against the proof: check its assumptions"
+                if negative(run) and design.positive
+                else "; proved for observers that start low"
+                if design.positive
+                else "; not proved"
+            ),
             "caution"
             if lowest is None
             else "bad"
@@ -199,6 +210,10 @@ def tiles(run: Run) -> list[tuple[str, str, str, str]]:
             "good" if design.rate is not None and design.rate > 0 else "bad",
         ),
     ]
+
+
+def _size(error: float | None, diverged: bool) -> str:
+    return "not finite" if error is None and diverged else show(error)
 
 
 def sector_statement(run: Run, k: int) -> str:
@@ -233,7 +248,9 @@ def describe(run: Run, values: Array, what: str) -> str:
     first, last = (_range(row) for row in (values[0], values[-1]))
     text = f"{span}. At the start {first}, at the end {last}."
     finite = values[np.isfinite(values)]
-    return f"{text} Extremes {show(finite.min())} and {show(finite.max())}." if finite.size else text
+    return (
+        f"{text} Extremes {show(finite.min())} and {show(finite.max())}." if finite.size else text
+    )
 
 
 def _range(row: Array) -> str:
@@ -249,7 +266,11 @@ def _range(row: Array) -> str:
 def describe_network(run: Run) -> str:
     """Alternative text of the network drawing."""
     pinned = [run.names[i] for i in run.network.pinned]
-    shown = join(pinned[:6]) if len(pinned) <= 6 else f"{', '.join(pinned[:6])} and {len(pinned) - 6} more"
+    shown = (
+        join(pinned[:6])
+        if len(pinned) <= 6
+        else f"{', '.join(pinned[:6])} and {len(pinned) - 6} more"
+    )
     return (
         f"Digraph of {run.N} agent{'s' * (run.N != 1)} and {run.network.adjacency.nnz} arcs. "
         f"The leader is heard by {shown or 'nobody'}. Final errors from "
