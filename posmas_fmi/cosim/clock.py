@@ -40,7 +40,7 @@ class Clock:
             If the period is no whole number of nanoseconds, or `until` no multiple of it.
         """
         ticks = round(period * TICKS_PER_SECOND)
-        if ticks < 1 or abs(ticks - period * TICKS_PER_SECOND) > 1e-6 * ticks:
+        if ticks < 1 or abs(ticks - period * TICKS_PER_SECOND) > max(1e-3, 1e-14 * ticks):
             raise InputError(
                 f"expected a period of whole nanoseconds (got {period!r} s)", "$.scenario.period"
             )

@@ -172,7 +172,8 @@ class _Run:
         ended: Any = "complete"
         reason = agent = ""
         try:
-            self._loop()
+            with np.errstate(invalid="ignore", over="ignore"):  # running away is a verdict
+                self._loop()
         except _Stop as stop:
             ended, reason, agent = stop.ended, stop.reason, stop.agent
         except FmuCallError as error:
