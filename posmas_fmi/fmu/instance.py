@@ -115,8 +115,11 @@ class FmuFile:
         name = identifier + fmpy.sharedLibraryExtension
         self.library = self._folder / "binaries" / binaries / name
         if not self.library.is_file():
-            others = ", ".join(fmpy.supported_platforms(str(self.path))) or "none"
-            raise FmuError(f"expected a binary for {binaries} (the FMU is for {others})", where)
+            there = sorted(path.parent.name for path in self._folder.glob("binaries/*/*"))
+            has = ", ".join(dict.fromkeys(there)) or "none"
+            raise FmuError(
+                f"expected {name} among the binaries for {binaries} (the FMU has {has})", where
+            )
         slave: Any = FMU2Slave if self.version == 2 else FMU3Slave
         before = os.getcwd()
         try:
