@@ -28,7 +28,7 @@ from posmas_fmi.fmu.description import build_description, model_description
 from posmas_fmi.fmu.model import FmuModel
 from posmas_fmi.fmu.plant import agent_functions, read_plant, shipped_plants
 from posmas_fmi.fmu.positive_agent import positive_agent
-from posmas_fmi.fmu.sources import FmiVersion, compiled, instantiation_token, sources
+from posmas_fmi.fmu.sources import FmiVersion, compiled, sources
 
 _LOG = logging.getLogger(__name__)
 
@@ -89,9 +89,10 @@ def fmu(
 
 def file_name(model: FmuModel, fmi: FmiVersion, platforms: Sequence[Platform]) -> str:
     """Name of the archive: the model, the FMI version and a hash of all that goes into it."""
-    content = (instantiation_token(model, fmi), *(p.name for p in platforms), *FLAGS)
-    key = hashlib.sha256("\n".join(content).encode()).hexdigest()[:16]
-    return f"{model.name}-fmi{fmi}-{key}.fmu"
+    files = sources(model, fmi)
+    key = hashlib.sha256(model_description(model, fmi, compiled(files)))  # tells the sources' hash
+    key.update("\n".join((*(p.name for p in platforms), *FLAGS)).encode())
+    return f"{model.name}-fmi{fmi}-{key.hexdigest()[:16]}.fmu"
 
 
 def archive(model: FmuModel, fmi: FmiVersion, platforms: Sequence[Platform]) -> bytes:

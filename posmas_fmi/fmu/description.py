@@ -133,6 +133,7 @@ def _fmi2(model: FmuModel, sources: Sequence[str]) -> ET.Element:
         modelName=model.name,
         guid=instantiation_token(model, 2),
         description=model.description,
+        license="BSD-3-Clause",
         generationTool=_GENERATOR,
         variableNamingConvention="structured",
         numberOfEventIndicators="0",
@@ -213,6 +214,7 @@ def _fmi3(model: FmuModel) -> ET.Element:
         modelName=model.name,
         instantiationToken=instantiation_token(model, 3),
         description=model.description,
+        license="BSD-3-Clause",
         generationTool=_GENERATOR,
         variableNamingConvention="structured",
     )

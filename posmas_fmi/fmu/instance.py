@@ -131,6 +131,9 @@ class FmuFile:
         finally:
             os.chdir(before)  # FMPy leaves it changed when loading fails
         self._functions: dict[str, Any] = self._fmu._functions
+        resources = self._folder / "resources"
+        place = resources.as_uri() if self.version == 2 else f"{resources}{os.sep}"
+        self._resources = place.encode()
         state = "FMUstate" if self.version == 2 else "FMUState"
         self._frees = _Frees(
             self._functions[f"fmi{self.version}FreeInstance"],
@@ -185,11 +188,10 @@ class FmuFile:
         return FmuInstance(self, name, key)
 
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
-        resources = self._folder / "resources"
         text, token = name.encode(), self.token.encode()
         if self.version == 2:
             arguments: tuple[Any, ...] = (
-                *(text, 1, token, resources.as_uri().encode()),
+                *(text, 1, token, self._resources),
                 *(ctypes.byref(callbacks), 0, 0),  # neither visible nor debug logging
             )
             function = "fmi2Instantiate"
@@ -197,7 +199,7 @@ class FmuFile:
             from fmpy.fmi3 import fmi3IntermediateUpdateCallback
 
             arguments = (
-                *(text, token, f"{resources}{os.sep}".encode()),
+                *(text, token, self._resources),
                 *(False, False),  # neither visible nor debug logging
                 *(False, False, None, 0),  # no event mode, early return, intermediate variables
                 *(key, callbacks, fmi3IntermediateUpdateCallback()),

@@ -106,9 +106,9 @@ def element_names(name: str, shape: tuple[int, ...]) -> Iterator[str]:
 class Experiment:
     """The default experiment of an FMU: stop time, communication step [s], relative tolerance."""
 
-    stop: float = 10.0
-    step: float = 0.01
-    tolerance: float = 1e-10
+    stop: float = attrs.field(default=10.0, converter=float)
+    step: float = attrs.field(default=0.01, converter=float)
+    tolerance: float = attrs.field(default=1e-10, converter=float)
 
 
 @attrs.frozen

@@ -10,12 +10,11 @@
 
 #include "solver.h"
 
-/* Times of the importer and of the instance may differ by rounding only. */
-#define TIME_TOLERANCE 1e-9
-
-static double time_slack(double t)
+/* Times of the importer and of the instance may differ by rounding, and by no part of a step that
+ * would matter. */
+static double time_slack(double t, double step)
 {
-    return TIME_TOLERANCE * fmax(1, fabs(t));
+    return 1e-12 * fmax(1, fabs(t)) + 1e-6 * step;
 }
 
 /* ---- messages ---------------------------------------------------------------------------- */
@@ -326,12 +325,12 @@ Status instance_step(Instance *c, double time, double step)
                      step);
         return STATUS_ERROR;
     }
-    if (fabs(time - s->v[AT_TIME]) > time_slack(time)) {
+    if (fabs(time - s->v[AT_TIME]) > time_slack(time, step)) {
         instance_log(c, STATUS_ERROR, "DoStep from %.17g, but the instance is at %.17g", time,
                      s->v[AT_TIME]);
         return STATUS_ERROR;
     }
-    if (time + step > s->stop_time + time_slack(s->stop_time)) {
+    if (time + step > s->stop_time + time_slack(time, step)) {
         instance_log(c, STATUS_ERROR, "DoStep to %.17g, beyond the stop time %.17g", time + step,
                      s->stop_time);
         return STATUS_ERROR;
