@@ -42,11 +42,11 @@ def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
     if unreached or loop.protocol == "printed":
         return _not_held(loop, unreached)
     plain, sharp = loop.weights, loop.weights_perron
-    observer = _Prover(loop, loop.estimator(sharp), sharp)
-    best = _Prover(loop, loop.controller(sharp), sharp)
+    observer = Prover(loop, loop.estimator(sharp), sharp)
+    best = Prover(loop, loop.controller(sharp), sharp)
     controller, chosen = best, sharp
     if weights != "perron":
-        simple = _Prover(loop, loop.controller(plain), plain, best.signs)
+        simple = Prover(loop, loop.controller(plain), plain, best.signs)
         if simple.rate is not None or weights == "p":
             controller, chosen = simple, plain
     conditions = (
@@ -71,8 +71,18 @@ def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
     )
 
 
-class _Prover:
-    """Everything about one feedback: its signs, its contraction, its rates."""
+class Prover:
+    """Everything about one feedback: its signs, its contraction, its rates.
+
+    Parameters
+    ----------
+    loop : Loop
+    feedback : Feedback
+    weights : Weights
+        Those of the feedback.
+    signs : tuple of Condition, optional
+        Conditions P and T on signs, where they are known already.
+    """
 
     def __init__(
         self,
@@ -95,6 +105,11 @@ class _Prover:
             self.contracts = contracts(factor, feedback, loop.period, self.positive)
             rate = rate_of(factor, loop.period)
         self.rate = rate
+
+    @property
+    def proved(self) -> bool:
+        """Whether signs and contraction are both proved."""
+        return self.positive and self.contracts.holds
 
     def _signs(self) -> tuple[Condition, ...]:
         loop, feedback = self.loop, self.feedback

@@ -77,6 +77,15 @@ def identity(n: int) -> Any:
     return dyadic(np.eye(n))
 
 
+def diagonal(values: Any) -> Any:
+    """Diagonal matrix of fractions; floats are taken as the doubles they are."""
+    exact = values if np.asarray(values).dtype == object else dyadic(values)
+    out = np.full((len(exact), len(exact)), Fraction(0), dtype=object)
+    for k, value in enumerate(exact):
+        out[k, k] = value
+    return out
+
+
 def pivots(M: Any) -> list[Fraction]:
     """Pivots of LDLᵀ of a symmetric rational matrix, up to the first that is not positive.
 
@@ -192,7 +201,7 @@ def verified_cholesky(M: Array, inexact: float = 0.0) -> Definiteness:
 
 
 def _enclosed_cholesky(M: Any) -> Definiteness:
-    """Verified Cholesky of a rational matrix too large for rational elimination."""
+    """Prove a rational matrix positive that is too large for rational elimination."""
     nearest = np.array(M, dtype=float)
     rounding = float(UNIT * 1.01 * np.abs(nearest).sum(axis=1).max())
     return verified_cholesky(0.5 * (nearest + nearest.T), rounding)

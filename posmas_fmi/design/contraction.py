@@ -11,6 +11,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.certify import Loop
+from posmas_fmi.certify.closed_loop import Prover
 from posmas_fmi.certify.loop import Feedback
 from posmas_fmi.design.explain import clash
 from posmas_fmi.design.gains import certified
@@ -31,17 +32,9 @@ def design(
 ) -> Design:
     """Design K and E, and certify the rounded gains."""
     network.require_reached()
-    made: Design | None = None
-    for tightening in _TIGHTENINGS:
-        K, rate = controller_gain(agent, network, settings, period, tightening)
-        E = observer_gain(agent, network, settings, period, rate, tightening)
-        made = certified(agent, network, K, E, settings, period)
-        # the printed protocol fails whatever the gains
-        if made.certificate.certified != "no" or settings.protocol == "printed":
-            return made
-    assert made is not None
-    failed = "; ".join(f"{c.name}: {c.proof}" for c in made.certificate.failing)
-    raise DesignError(f"gains were found but could not be proved: {failed}", "$.design")
+    K, rate = controller_gain(agent, network, settings, period)
+    E = observer_gain(agent, network, settings, period, rate)
+    return certified(agent, network, K, E, settings, period)
 
 
 def problem_of(loop: Loop, feedback: Feedback, tightening: float, period: float | None) -> Problem:
@@ -68,7 +61,6 @@ def controller_gain(
     network: Network,
     settings: DesignSettings,
     period: float | None,
-    tightening: float = 1e-5,
 ) -> tuple[Array, float]:
     """K ≤ 0 as it ships, and the rate that it gives [1/s].
 
@@ -80,15 +72,19 @@ def controller_gain(
     loop = _bare(agent, network, settings, period)
     weights = loop.weights if settings.weights == "p" else loop.weights_perron
     feedback = loop.controller(weights)
-    problem = problem_of(loop, feedback, tightening, period)
-    _require_metzler(loop, problem, "controller")
-    found = alternate(problem, "fast")
-    if found is None or found.rate <= (settings.rate or 0.0):
-        raise clash(loop, feedback, problem, found, settings)
-    if settings.objective == "gain":
-        assert settings.rate is not None
-        found = alternate(problem, "small", settings.rate, found.v) or found
-    return -towards_zero(found.X / feedback.strong, settings.digits), found.rate
+    for tightening in _TIGHTENINGS:
+        problem = problem_of(loop, feedback, tightening, period)
+        _require_metzler(loop, problem, "controller")
+        found = alternate(problem, "fast")
+        if found is None or found.rate <= (settings.rate or 0.0):
+            raise clash(loop, feedback, problem, found, settings)
+        if settings.objective == "gain":
+            found = alternate(problem, "small", settings.rate, found.v) or found
+        K = -towards_zero(found.X / feedback.strong, settings.digits)
+        tried = attrs.evolve(loop, K=K)
+        if Prover(tried, tried.controller(weights), weights).proved:
+            return K, found.rate
+    raise _unproved("K")
 
 
 def observer_gain(
@@ -97,7 +93,6 @@ def observer_gain(
     settings: DesignSettings,
     period: float | None,
     rate: float,
-    tightening: float = 1e-5,
 ) -> Array:
     """E as it ships.
 
@@ -112,14 +107,28 @@ def observer_gain(
         If no E is both positive and contracting.
     """
     loop = _bare(agent, network, settings, period)
-    feedback = loop.estimator(loop.weights_perron)
-    problem = problem_of(loop, feedback, tightening, period)
-    _require_metzler(loop, problem, "observer")
+    weights = loop.weights_perron
+    feedback = loop.estimator(weights)
     wanted = settings.observer_rate or OBSERVER_FACTOR * rate
-    found = _reach(problem, wanted)
-    if found is None or (settings.observer_rate and found.rate < wanted * (1 - 1e-9)):
-        raise clash(loop, feedback, problem, found, settings)
-    return nearest(found.X / feedback.strong, settings.digits)
+    for tightening in _TIGHTENINGS:
+        problem = problem_of(loop, feedback, tightening, period)
+        _require_metzler(loop, problem, "observer")
+        found = _reach(problem, wanted)
+        if found is None or (settings.observer_rate and found.rate < wanted * (1 - 1e-9)):
+            raise clash(loop, feedback, problem, found, settings)
+        E = nearest(found.X / feedback.strong, settings.digits)
+        tried = attrs.evolve(loop, E=E)
+        if Prover(tried, tried.estimator(weights), weights).proved:
+            return E
+    raise _unproved("E")
+
+
+def _unproved(letter: str) -> DesignError:
+    return DesignError(
+        f"a gain {letter} was found but could not be proved after rounding; more digits "
+        "($.design.digits) or a shorter period help",
+        "$.design",
+    )
 
 
 def _reach(problem: Problem, wanted: float) -> Solution | None:

@@ -1,0 +1,522 @@
+"""Method "lmi": the corrected quadratic design, for when entrywise bounds are too coarse.
+
+Route L of theory.md: one scalar γ₀ of the graph, then two small semidefinite programs whatever the
+number of agents. ``V = Σ θ_i δ_iᵀ Π⁻¹ δ_i`` falls at the rate 2κ for every sector nonlinearity.
+Numbers are rounded first; what is proved is proved about the rounded ones, in exact arithmetic.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.agent import Agent, Assumption
+from posmas_fmi.certify.certificate import Certificate, Condition
+from posmas_fmi.certify.proof import (
+    Definiteness,
+    diagonal,
+    dyadic,
+    identity,
+    positive_definite,
+    rational,
+)
+from posmas_fmi.design.gains import certified
+from posmas_fmi.design.result import Design
+from posmas_fmi.design.rounding import nearest
+from posmas_fmi.design.settings import DesignSettings
+from posmas_fmi.design.solver import solve
+from posmas_fmi.errors import DesignError
+from posmas_fmi.expression import Array
+from posmas_fmi.network import Network
+
+_DENSE_AGENTS = 60  # beyond this the diagonal scaling is fixed and only one number is searched
+_BISECTIONS = 40
+_FACTORS = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of K, to leave room for sampling
+_OBSERVER_FACTOR = 3.0  # in a quadratic design fast observers cost much gain
+_SAFETY = 1e-5  # relative distance of proved scalars from their optima
+
+
+@attrs.frozen(eq=False)
+class GraphScalar:
+    """``γ₀`` with the diagonals that prove it.
+
+    Attributes
+    ----------
+    value : float
+        Proved: the graph matrix at this γ is positive definite.
+    Theta, T : (N,) array
+    proof : Definiteness
+    """
+
+    value: float
+    Theta: Array
+    T: Array
+    proof: Definiteness
+
+
+@attrs.frozen(eq=False)
+class Feedback:
+    """``K = -BᵀV/φ`` with V = Π⁻¹ diagonal, its rate κ and the proof.
+
+    Attributes
+    ----------
+    K : (p, m) array
+    V : (m,) array
+    kappa : float
+        Proved rate [1/s]; negative where none is.
+    theta : float
+        Multiplier of the Lipschitz bound.
+    proof : Definiteness
+    """
+
+    K: Array
+    V: Array
+    kappa: float
+    theta: float
+    proof: Definiteness
+
+
+def graph_matrix(
+    network: Network, sector: tuple[float, float], gamma: float, Theta: Array, T: Array
+) -> Any:
+    """``[[m(ΘM̂ + M̂ᵀΘ) - ρ² M̂ᵀTM̂ - γΘ, Θ], [Θ, T]]`` in rational arithmetic, (2N, 2N)."""
+    M = rational(network.pinned_laplacian.toarray())
+    low, high = (Fraction(repr(float(x))) for x in sector)
+    mean, half = (high + low) / 2, (high - low) / 2
+    theta, t = diagonal(Theta), diagonal(T)
+    weighted = theta @ M
+    top = mean * (weighted + weighted.T) - half**2 * (M.T @ t @ M) - Fraction(gamma) * theta
+    return np.block([[top, theta], [theta, t]])
+
+
+def graph_scalar(network: Network, sector: tuple[float, float]) -> GraphScalar:
+    """Largest γ₀ for which diagonal Θ, T ≻ 0 are found, and its proof.
+
+    Examples
+    --------
+    >>> from posmas_fmi.network import network_from_arcs
+    >>> one = network_from_arcs(1, [], [1])
+    >>> round(graph_scalar(one, (1.0, 1.0)).value, 3)
+    2.0
+    """
+    M = network.pinned_laplacian
+    eta = network.p
+    xi = np.asarray(
+        network.p if (abs(M - M.T)).nnz == 0 else np.linalg.solve(M.toarray().T, np.ones(network.N))
+    )
+    Theta = xi / eta
+    Theta = Theta / Theta.mean()
+    found = _search_scaling(network, sector, Theta)
+    if network.N <= _DENSE_AGENTS:
+        found = _bisect(network, sector, found)
+    value, Theta, T = found
+    for step in (_SAFETY, 1e-3, 1e-2, 1e-1):
+        gamma = value - step * abs(value) - 1e-12
+        proof = positive_definite(graph_matrix(network, sector, gamma, Theta, T))
+        if proof.positive:
+            return GraphScalar(gamma, Theta, T, proof)
+    raise DesignError("no graph scalar could be proved for this network", "$.network")
+
+
+def _search_scaling(
+    network: Network, sector: tuple[float, float], Theta: Array
+) -> tuple[float, Array, Array]:
+    """Line search over T = tΘ for a fixed Θ."""
+    from scipy.linalg import eigh
+    from scipy.optimize import minimize_scalar
+
+    M = network.pinned_laplacian.toarray()
+    mean, half = 0.5 * (sector[1] + sector[0]), 0.5 * (sector[1] - sector[0])
+    weighted = Theta[:, None] * M
+    first, second = mean * (weighted + weighted.T), half**2 * (M.T @ weighted)
+
+    def gamma(log_t: float) -> float:
+        t = np.exp(log_t)
+        scaled = first - t * second - np.diag(Theta) / t
+        return float(eigh(scaled, np.diag(Theta), eigvals_only=True, subset_by_index=[0, 0])[0])
+
+    best = minimize_scalar(lambda x: -gamma(x), bounds=(-15.0, 15.0), method="bounded")
+    return gamma(best.x), Theta, np.exp(best.x) * Theta
+
+
+def _bisect(
+    network: Network, sector: tuple[float, float], start: tuple[float, Array, Array]
+) -> tuple[float, Array, Array]:
+    """Bisection over γ with free Θ and T."""
+    import cvxpy as cp
+
+    M = network.pinned_laplacian.toarray()
+    n = network.N
+    mean, half = 0.5 * (sector[1] + sector[0]), 0.5 * (sector[1] - sector[0])
+    theta, t, slack = cp.Variable(n, pos=True), cp.Variable(n, pos=True), cp.Variable()
+    gamma = cp.Parameter()
+    D, S = cp.diag(theta), cp.diag(t)
+    scaled = cp.Variable(n)  # γθ, so that the program stays affine in the parameter
+    top = mean * (D @ M + M.T @ D) - half**2 * (M.T @ S @ M) - cp.diag(scaled)
+    block = cp.bmat([[top, D], [D, S]])
+    constraints = [
+        block >> slack * np.eye(2 * n),
+        cp.sum(theta) == n,
+        scaled == gamma * theta,
+        theta >= 1e-9,
+        slack <= 1,
+    ]
+    program = cp.Problem(cp.Maximize(slack), constraints)
+    value, Theta, T = start
+    low, high = value, value + max(1.0, 2 * mean * float(np.abs(M).sum(axis=1).max()))
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        gamma.value = middle
+        if _feasible(program, slack):
+            low, value, Theta, T = middle, middle, theta.value, t.value
+        else:
+            high = middle
+        if high - low < 1e-5 * max(abs(high), 1e-3):
+            break
+    return value, Theta, T
+
+
+def lipschitz_norm(agent: Agent) -> float:
+    """Bound β of the Euclidean Lipschitz constant: ``√(‖ℓ‖₁‖ℓ‖_∞)``, exact for diagonal ℓ = βI."""
+    ell = agent.ell
+    return float(np.sqrt(ell.sum(axis=0).max() * ell.sum(axis=1).max())) * (1 + 1e-12)
+
+
+def feedback_matrix(
+    agent: Agent, gamma: Fraction, V: Any, theta: Fraction, kappa: Fraction, beta: Fraction
+) -> Any:
+    """Minus the feedback LMI in the coordinates ``V = Π⁻¹``, in rational arithmetic, (2m, 2m).
+
+    ``[[VA + AᵀV - γ VBBᵀV + θ VHHᵀV + 2κV, βI], [βI, -θI]] ≺ 0`` is the LMI of theory.md times
+    diag(V, I) on both sides.
+    """
+    A, H, B = rational(agent.A), rational(agent.H), rational(agent.B)
+    one, D = identity(agent.m), diagonal(V)
+    VA, VB, VH = D @ A, D @ B, D @ H
+    top = VA + VA.T - gamma * (VB @ VB.T) + theta * (VH @ VH.T) + 2 * kappa * D
+    return -np.block([[top, beta * one], [beta * one, -theta * one]])
+
+
+def feedback_gain(
+    agent: Agent,
+    network: Network,
+    phi: float,
+    gamma: float,
+    digits: int,
+    room: Array | None,
+) -> Feedback:
+    """Fastest quadratic feedback, by bisection over κ.
+
+    Parameters
+    ----------
+    room : (m, m) array or None
+        ``room Π - m_h max(l_ii + d_i) BBᵀ`` is asked to be Metzler: ``A - |H|ℓ`` for certificate
+        P, A for the weaker condition of the theory, None for no positivity.
+
+    Raises
+    ------
+    DesignError
+        If not even a negative κ is found.
+    """
+    import cvxpy as cp
+
+    m, A, H, B = agent.m, agent.A, agent.H, agent.B
+    beta = lipschitz_norm(agent)
+    if not np.isfinite(beta):
+        raise DesignError("route L needs a finite Lipschitz bound of g", "$.agent.lipschitz")
+    # Π and the factor of BBᵀ scale together: Π is normalised, V = σ Π⁻¹
+    pi, theta, sigma, slack = (
+        cp.Variable(m, pos=True),
+        cp.Variable(pos=True),
+        cp.Variable(pos=True),
+        cp.Variable(),
+    )
+    kappa = cp.Parameter()
+    shifted = cp.Variable(m)
+    Pi = cp.diag(pi)
+    top = A @ Pi + Pi @ A.T - gamma * sigma * B @ B.T + theta * H @ H.T + 2 * cp.diag(shifted)
+    block = cp.bmat([[top, beta * Pi], [beta * Pi, -theta * np.eye(m)]])
+    constraints = [
+        block << -slack * np.eye(2 * m),
+        shifted == kappa * pi,
+        cp.sum(pi) == m,
+        pi >= 1e-6,
+        sigma <= 1e6,
+        slack <= 1,
+    ]
+    if room is not None:
+        degree = float((network.in_degree + network.pinning).max())
+        BB = B @ B.T
+        constraints += [
+            room[i, j] * pi[j] >= agent.m_h * degree * BB[i, j] * (1 + _SAFETY) * sigma
+            for i in range(m)
+            for j in range(m)
+            if i != j
+        ]
+    program = cp.Problem(cp.Maximize(slack), constraints)
+    size = float(np.abs(A).sum() + np.abs(H).sum() * beta) + 1.0
+    low, high, best = -size, 2 * size, None
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        kappa.value = middle
+        if _feasible(program, slack):
+            low, best = middle, (pi.value / sigma.value, float(theta.value / sigma.value))
+        else:
+            high = middle
+        if high - low < 1e-6 * max(1.0, abs(high)):
+            break
+    if best is None:
+        raise DesignError("no diagonal quadratic feedback was found", "$.design.method")
+    return _proved_feedback(agent, phi, gamma, beta, best, low, digits)
+
+
+def _feasible(program: Any, slack: Any) -> bool:
+    """Whether the solver finds a strictly feasible point; its failures count as no."""
+    try:
+        return solve(program, "bisection") and slack.value is not None and slack.value > 1e-7
+    except DesignError:
+        return False
+
+
+def _proved_feedback(
+    agent: Agent,
+    phi: float,
+    gamma: float,
+    beta: float,
+    found: tuple[Array, float],
+    kappa: float,
+    digits: int,
+) -> Feedback:
+    """Round V, form K from it, and prove a rate for the rounded numbers."""
+    V = nearest(1.0 / found[0], digits)
+    K = nearest(-(agent.B.T * V) / phi, 15)
+    return prove_feedback(agent, phi, gamma, K, V, found[1], kappa)
+
+
+def prove_feedback(
+    agent: Agent, phi: float, gamma: float, K: Array, V: Array, theta: float, kappa: float
+) -> Feedback:
+    """Prove the rate κ, or one a little below it, for a given K.
+
+    Parameters
+    ----------
+    K : (p, m) array
+        ``-BᵀV/φ``; with one input V is taken from it, so that the proof is about K as it ships.
+    V : (m,) array
+    theta, kappa : float
+        From the semidefinite program.
+    """
+    beta, exact = lipschitz_norm(agent), _scaling_of(agent, phi, K, V)
+    outcome = Definiteness(float("nan"), -np.inf, "not tried")
+    for step in (_SAFETY, 1e-4, 1e-3, 1e-2):
+        rate = kappa - step * max(abs(kappa), 1e-3)
+        outcome = positive_definite(
+            feedback_matrix(
+                agent, Fraction(gamma), exact, Fraction(theta), Fraction(rate), Fraction(beta)
+            )
+        )
+        if outcome.positive:
+            return Feedback(K, V, rate, theta, outcome)
+    return Feedback(K, V, -np.inf, theta, outcome)
+
+
+def _scaling_of(agent: Agent, phi: float, K: Array, V: Array) -> Any:
+    """V with ``K = -BᵀV/φ`` exactly where there is one input; else V, with K to 15 digits."""
+    exact = rational(V)
+    if agent.p == 1:
+        B, gains, coupling = rational(agent.B)[:, 0], rational(K)[0], Fraction(repr(float(phi)))
+        for k in range(agent.m):
+            if B[k] != 0:
+                exact[k] = -coupling * gains[k] / B[k]
+    return exact
+
+
+def scaled_feedback(
+    agent: Agent, phi: float, gamma: float, base: Feedback, factor: float
+) -> Feedback:
+    """Return the same feedback times a factor below one, with the rate that it still has."""
+    V, theta = base.V * factor, base.theta / factor
+    K = nearest(base.K * factor, 6)
+    beta = lipschitz_norm(agent)
+    exact = _scaling_of(agent, phi, K, V)
+
+    def least(rate: float) -> float:
+        M = feedback_matrix(
+            agent, Fraction(gamma), exact, Fraction(theta), Fraction(rate), Fraction(beta)
+        )
+        return float(np.linalg.eigvalsh(np.array(M, dtype=float))[0])
+
+    size = float(np.abs(agent.A).sum()) + 1.0
+    low, high = -size, max(base.kappa, 0.0) + size
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if least(middle) > 0 else (low, middle)
+    return prove_feedback(agent, phi, gamma, K, V, theta, low)
+
+
+def observer_gain(agent: Agent, rate: float, digits: int) -> tuple[Array, float, Definiteness]:
+    """Local observer with least ``‖W‖`` for the rate κ_e; E, the proved rate, the proof.
+
+    Raises
+    ------
+    DesignError
+        If no positive observer has that rate.
+    """
+    import cvxpy as cp
+
+    m, q, A, H, C = agent.m, agent.q, agent.A, agent.H, agent.C
+    beta = lipschitz_norm(agent)
+    p, s, W = cp.Variable(m, pos=True), cp.Variable(pos=True), cp.Variable((m, q))
+    P = cp.diag(p)
+    S = P @ A - W @ C
+    top = S + S.T + beta**2 * s * np.eye(m) + 2 * rate * (1 + _SAFETY) * P
+    block = cp.bmat([[top, P @ H], [H.T @ P, -s * np.eye(m)]])
+    room = P @ (A - agent.H_ell) - W @ C
+    constraints = [
+        block << -1e-6 * np.eye(2 * m),
+        p >= 1,
+        W @ C >= 0,
+    ]
+    constraints += [room[i, j] >= 1e-6 for i in range(m) for j in range(m) if i != j]
+    program = cp.Problem(cp.Minimize(cp.sum(cp.abs(W)) + 1e-6 * cp.sum(p)), constraints)
+    if not solve(program, "observer") or W.value is None:
+        raise DesignError(
+            f"no positive quadratic observer has the rate {rate:.4g} 1/s; ask for a lower "
+            'observer_rate, or use method = "contraction"',
+            "$.design.observer_rate",
+        )
+    E = nearest(W.value / p.value[:, None], digits, relative_zero=1e-6)
+    proof = positive_definite(
+        observer_matrix(
+            agent,
+            rational(E),
+            dyadic(p.value),
+            Fraction(float(s.value)),
+            Fraction(rate),
+            Fraction(beta),
+        )
+    )
+    return E, rate if proof.positive else -np.inf, proof
+
+
+def observer_matrix(
+    agent: Agent, E: Any, P: Any, s: Fraction, rate: Fraction, beta: Fraction
+) -> Any:
+    """Minus the observer LMI in rational arithmetic, (2m, 2m)."""
+    A, H, C = rational(agent.A), rational(agent.H), rational(agent.C)
+    one, D = identity(agent.m), diagonal(P)
+    S, PH = D @ (A - E @ C), D @ H
+    top = S + S.T + beta**2 * s * one + 2 * rate * D
+    return -np.block([[top, PH], [PH.T, -s * one]])
+
+
+def design(
+    agent: Agent, network: Network, settings: DesignSettings, period: float | None
+) -> Design:
+    """Design by route L, then see what certificates P and T say about the shipped gains."""
+    network.require_reached()
+    graph = graph_scalar(network, (agent.m_l, agent.m_h))
+    room = agent.A - agent.H_ell
+    feedback = feedback_gain(agent, network, settings.phi, graph.value, settings.digits, room)
+    if feedback.kappa <= 0:
+        raise DesignError(
+            f"route L proves no contraction: kappa = {feedback.kappa:.4g} 1/s with gamma_0 = "
+            f"{graph.value:.4g}; another pinned agent changes gamma_0, and "
+            'method = "contraction" may do better',
+            "$.design.method",
+        )
+    estimate = _observer(agent, network, settings, period, feedback.kappa)
+    made = None
+    for factor in _FACTORS:
+        if factor < 1.0:
+            weaker = scaled_feedback(agent, settings.phi, graph.value, feedback, factor)
+            if weaker.kappa <= 0:
+                break
+            feedback = weaker
+        made = certified(agent, network, feedback.K, estimate.E, settings, period)
+        failing = [c.name for c in made.certificate.failing]
+        if not any("controller" in name or " BK" in name for name in failing):
+            break
+    assert made is not None
+    return attrs.evolve(
+        made, certificate=_with_route_l(made.certificate, graph, feedback, estimate)
+    )
+
+
+@attrs.frozen(eq=False)
+class Estimate:
+    """Observer gain and what is proved about it by route L; `condition` None where P and T do."""
+
+    E: Array
+    rate: float | None
+    condition: Condition | None
+
+
+def _observer(
+    agent: Agent,
+    network: Network,
+    settings: DesignSettings,
+    period: float | None,
+    kappa: float,
+) -> Estimate:
+    if settings.observer == "distributed":
+        from posmas_fmi.design import contraction
+
+        return Estimate(
+            contraction.observer_gain(agent, network, settings, period, kappa), None, None
+        )
+    wanted = settings.observer_rate or _OBSERVER_FACTOR * kappa
+    E, rate, proof = observer_gain(agent, wanted, settings.digits)
+    condition = Condition.from_margin(
+        "L: observer contracts", proof.bound, f"kappa_e = {rate:.9g} 1/s: {proof}"
+    )
+    return Estimate(E, rate if proof.positive else None, condition)
+
+
+def _with_route_l(
+    found: Certificate, graph: GraphScalar, feedback: Feedback, estimate: Estimate
+) -> Certificate:
+    """Put route L in front; what P and T do not prove becomes an assumption, by name."""
+    own = [
+        Condition.from_margin(
+            "L: graph scalar", graph.proof.bound, f"gamma_0 = {graph.value:.9g}: {graph.proof}"
+        ),
+        Condition.from_margin(
+            "L: feedback contracts",
+            feedback.proof.bound,
+            f"kappa = {feedback.kappa:.9g} 1/s: {feedback.proof}",
+        ),
+    ]
+    if estimate.condition is not None:
+        own.append(estimate.condition)
+    kept = [c for c in found.conditions if c.holds or c.name.startswith("network")]
+    dropped = [c for c in found.conditions if c not in kept]
+    assumed = list(found.assumptions)
+    if any(c.name.startswith("P:") or "keeps signs" in c.name for c in dropped):
+        assumed.append(
+            Assumption("positivity", "declared", _names("not proved entry by entry", dropped))
+        )
+    if any("contracts" in c.name for c in dropped) and found.period is not None:
+        assumed.append(
+            Assumption(
+                "sampling",
+                "declared",
+                _names(f"a period of {found.period:g} s is taken as continuous", dropped),
+            )
+        )
+    if estimate.condition is None and any("observer" in c.name for c in dropped):
+        kept += [c for c in dropped if "observer" in c.name]
+    return attrs.evolve(
+        found,
+        assumptions=tuple(assumed),
+        conditions=(*own, *kept),
+        rate=found.rate if found.rate is not None else feedback.kappa,
+        observer_rate=found.observer_rate if found.observer_rate is not None else estimate.rate,
+    )
+
+
+def _names(text: str, dropped: list[Condition]) -> str:
+    return f"{text}; not proved: " + ", ".join(c.name for c in dropped)

@@ -1,0 +1,46 @@
+"""Semidefinite programs through cvxpy and clarabel; a status is a hint here, never a proof."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from posmas_fmi.errors import DesignError
+
+_USABLE = ("optimal", "optimal_inaccurate")
+
+
+def solve(problem: Any, what: str) -> bool:
+    """Solve a cvxpy problem in place.
+
+    Parameters
+    ----------
+    problem : cvxpy.Problem
+    what : str
+        Name of the program, for the error.
+
+    Returns
+    -------
+    bool
+        Whether there is a point to round and prove; False for infeasible or unbounded programs.
+
+    Raises
+    ------
+    DesignError
+        If the solver breaks down.
+    """
+    import cvxpy as cp
+
+    try:
+        problem.solve(solver=cp.CLARABEL)
+    except cp.error.SolverError as error:
+        raise DesignError(f"{what}: the solver failed ({error})", "$.design.method") from error
+    except BaseException as error:
+        # clarabel is written in Rust: a panic there is no Exception
+        if type(error).__name__ == "PanicException":
+            raise DesignError(
+                f"{what}: the solver panicked ({error}); a problem near the boundary of "
+                "feasibility does that, move a bound a little",
+                "$.design.method",
+            ) from None
+        raise
+    return problem.status in _USABLE
