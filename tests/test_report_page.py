@@ -147,6 +147,35 @@ def test_diverged_run_says_who_was_lost_and_when(tmp_path: Path) -> None:
     assert "“C: closed loop contracts” failed" in text
 
 
+@pytest.mark.parametrize(
+    ("verdict", "complete", "expected"),
+    [
+        ("not converged", 1, "Not converged: the largest tracking error is"),
+        ("positivity lost", 1, "Positivity is lost (lowest state −0.4), the tracking error is"),
+        ("failed", 0, "An FMU failed at t = 0.5 s"),
+        ("cancelled", 0, "The run was cancelled at t = 0.5 s: the largest tracking error was"),
+    ],
+)
+def test_every_verdict_of_the_master_is_put_into_words(
+    verdict: str, complete: int, expected: str, tmp_path: Path
+) -> None:
+    lp, d = laplacians(4, ARCS, [2])
+    signals = simulate(lp, d, until=0.5)
+    write_run(tmp_path, signals, ARCS, [2], verdict=verdict, complete=complete)
+    path = tmp_path / "summary.json"
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    summary["reason"] = "agent 3: doStep returned Error"
+    if verdict == "positivity lost":
+        summary["min_state"] = -0.4
+    summary["agents"][2]["min_state"] = 0.1234
+    path.write_text(json.dumps(summary), encoding="utf-8")
+    text = _Page(page_of(tmp_path)).text
+    assert expected in text
+    assert "Agent 3: doStep returned Error." in text
+    assert "0.123" in text
+    assert "no state became negative" not in text or verdict != "positivity lost"
+
+
 @pytest.mark.parametrize("tail", ["huge", "infinite", "missing"])
 def test_absurd_values_still_give_a_report(tail: str, tmp_path: Path) -> None:
     lp, d = laplacians(4, ARCS, [2])
@@ -318,7 +347,7 @@ def test_summary_comparison_becomes_a_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["results.nc", "design.json", "summary.json", "manifest.json"]
 )  # fmt: skip
-@pytest.mark.parametrize("damage", ["missing", "empty", "binary", "folder", "cut"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "binary", "folder", "cut", "holes"])
 def test_bad_file_is_one_error_with_name_and_remedy(
     name: str, damage: str, converged: Path, tmp_path: Path
 ) -> None:
@@ -329,7 +358,13 @@ def test_bad_file_is_one_error_with_name_and_remedy(
     if damage == "folder":
         path.mkdir()
     elif damage != "missing":
-        path.write_bytes({"empty": b"", "binary": b"\x00\xff" * 50, "cut": content[:-40]}[damage])
+        damaged = {
+            "empty": b"",
+            "binary": b"\x00\xff" * 50,
+            "cut": content[:-40],
+            "holes": content[:96] + bytes(len(content) - 96),
+        }
+        path.write_bytes(damaged[damage])
     with pytest.raises(InputError, match="posmas-fmi run") as caught:
         write_report(tmp_path)
     assert caught.value.where == str(path)

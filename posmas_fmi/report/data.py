@@ -46,6 +46,7 @@ class DesignFacts:
     assumptions: tuple[Assumption, ...]
     rate: float | None
     observer_rate: float | None
+    rate_perron: float | None
     positive: bool
     p_max: float | None
     period: float | None
@@ -64,6 +65,7 @@ class AgentVerdict:
     name: str
     status: str
     final_error: float | None
+    min_state: float | None = None
 
 
 @attrs.frozen
@@ -71,6 +73,7 @@ class Summary:
     """What ``summary.json`` says about the run; derived from the results if the run was cut off."""
 
     verdict: str
+    reason: str
     agents: tuple[AgentVerdict, ...]
     tracking_error: float | None
     estimation_error: float | None
@@ -78,7 +81,7 @@ class Summary:
     wall_s: float | None
     steps: int | None
     comparison: Mapping[str, Any]
-    messages: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 @attrs.frozen(eq=False)

@@ -353,13 +353,11 @@ def _mark_loss(axes: Axes, run: Run) -> None:
     axes.annotate(
         f"agent {run.names[agent][:16]} lost, t = {time:.3g}",
         (time, 1.0),
-        (4 if right else -4, -2),
+        (0, 2),
         xycoords=("data", "axes fraction"),
         textcoords="offset points",
         ha="left" if right else "right",
-        va="top",
+        va="bottom",
         color="#a34700",
         fontsize=8,
-        bbox={"fc": "white", "ec": "none", "pad": 1.0, "alpha": 0.85},
-        zorder=5,
     )

@@ -129,6 +129,7 @@ def design_facts(content: dict[str, Any], manifest: Mapping[str, Any], path: Pat
         assumptions=tuple(_assumption(entry) for entry in keys.objects("assumptions")),
         rate=keys.number("rate"),
         observer_rate=keys.number("observer_rate"),
+        rate_perron=keys.number("rate_perron"),
         positive=keys.flag("positive"),
         p_max=keys.number("p_max"),
         period=keys.number("period"),
@@ -184,17 +185,27 @@ def _sector_of_scenario(manifest: Mapping[str, Any]) -> tuple[float, float] | No
     return None
 
 
+def _traffic(keys: _Keys) -> tuple[str, ...]:
+    sent, lost = keys.number("messages_sent"), keys.number("messages_lost")
+    if not sent:
+        return ()
+    share = f", {100 * lost / sent:.3g} % of them lost" if lost else ", none lost"
+    return (f"{sent:.0f} messages between agents{share}",)
+
+
 def summary_facts(content: dict[str, Any], path: Path) -> Summary:
     """Return what ``summary.json`` says; InputError names the key that is not as agreed."""
     keys = _Keys(content, path)
     steps = keys.number("steps")
     return Summary(
         verdict=keys.text("verdict"),
+        reason=keys.text("reason", ""),
         agents=tuple(
             AgentVerdict(
                 str(entry.content.get("name", "")),
                 entry.text("status", ""),
                 entry.number("final_error"),
+                entry.number("min_state"),
             )
             for entry in keys.objects("agents")
         ),
@@ -204,5 +215,5 @@ def summary_facts(content: dict[str, Any], path: Path) -> Summary:
         wall_s=keys.number("wall_s"),
         steps=None if steps is None or math.isinf(steps) else int(steps),
         comparison=keys.mapping("comparison"),
-        messages=keys.texts("messages"),
+        notes=(*keys.texts("messages"), *_traffic(keys)),
     )

@@ -210,7 +210,7 @@ def _nodes(axes: Axes, run: Run, xy: Array, radius: float, scale: _Scale) -> Non
 
 
 def _key(figure: Figure, run: Run, scale: _Scale, height: float) -> None:
-    """Draw the colour scale, in steps so that it stays vector graphics."""
+    """Draw the colour scale, in steps so that it stays vector graphics, each over the last."""
     from matplotlib.patches import Rectangle
 
     axes = figure.add_axes((0.3, 0.36 / height, 0.4, 0.13 / height))
@@ -218,7 +218,7 @@ def _key(figure: Figure, run: Run, scale: _Scale, height: float) -> None:
     for k in range(steps):
         part = (k + 0.5) / steps
         fill, _ = scale(scale.low * (scale.high / scale.low) ** part)
-        axes.add_patch(Rectangle((k / steps, 0), 1.6 / steps, 1, fc=fill, lw=0))
+        axes.add_patch(Rectangle((k / steps, 0), 1 - k / steps, 1, fc=fill, lw=0))
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1)
     axes.set_yticks([])

@@ -46,6 +46,7 @@ class AgentRow:
     status: str
     final_error: str
     estimation_error: str
+    lowest: str
     lost_at: str
 
 
@@ -92,10 +93,12 @@ def render(run: Run) -> str:
         beside=run.N <= FEW_NODES and all(len(name) <= 12 for name in run.names),
         agents=_agent_rows(run),
         most_rows=FEW_NODES,
+        show_lowest=any(agent.min_state is not None for agent in run.summary.agents),
         legend=_legend(run),
         panels=_panels(run) if run.time.size else (),
         inputs=_inputs(run) if run.time.size else (),
         baseline=_baseline(run) if run.time.size else None,
+        baseline_statement=wording.baseline_statement(run),
         comparison=_comparison(run.summary.comparison),
         provenance=tuple(_flat(run.manifest)),
         attachments=tuple(_long_texts(run.manifest)),
@@ -137,6 +140,7 @@ def _agent_rows(run: Run) -> list[AgentRow]:
                 status=verdicts[i].status if verdicts else "",
                 final_error=_last_error(run.tracking_error, i),
                 estimation_error=_last_error(estimation, i),
+                lowest=show(verdicts[i].min_state) if verdicts else "–",
                 lost_at=show(float(run.lost_at[i])) if np.isfinite(run.lost_at[i]) else "",
             )
         )

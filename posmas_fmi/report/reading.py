@@ -13,7 +13,7 @@ from posmas_fmi.report.foreign import number
 from posmas_fmi.report.json_files import design_facts, read_json, summary_facts
 from posmas_fmi.report.results_file import read_results
 
-_NO_SUMMARY = Summary("", (), None, None, None, None, None, {}, ())
+_NO_SUMMARY = Summary("", "", (), None, None, None, None, None, {}, ())
 
 
 def read_run(folder: Path) -> Run:
@@ -52,6 +52,7 @@ def _derived_summary(run: Run) -> Summary:
     lost = np.isfinite(run.lost_at)
     return Summary(
         verdict="diverged" if lost.any() else "cut off",
+        reason="",
         agents=tuple(
             AgentVerdict(name, "lost" if lost[i] else "cut off", number(error[i]))
             for i, name in enumerate(run.names)
@@ -66,5 +67,5 @@ def _derived_summary(run: Run) -> Summary:
         wall_s=None,
         steps=max(len(run.time) - 1, 0) * run.stride,
         comparison={},
-        messages=(),
+        notes=(),
     )

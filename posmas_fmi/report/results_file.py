@@ -37,11 +37,14 @@ def read_results(path: Path) -> dict[str, Any]:
     InputError
         If the file is missing, damaged, or not the results of a run.
     """
+    import h5py
     import xarray
 
     if not path.is_file():
         raise InputError(f"the file is missing; {AGAIN}", str(path))
     try:
+        with h5py.File(path, "r") as file:  # the layers above leave a half-open file behind
+            dict(file.attrs)
         dataset = xarray.open_dataset(
             path, engine="h5netcdf", decode_times=False, decode_coords=False
         )

@@ -39,7 +39,7 @@ def join(words: list[str]) -> str:
 
 def tone(run: Run) -> str:
     """``good``, ``caution`` or ``bad``: the colour of the verdict, never the only sign of it."""
-    if run.summary.verdict == "diverged" or run.first_lost or negative(run):
+    if run.summary.verdict in ("diverged", "failed") or run.first_lost or negative(run):
         return "bad"
     if run.summary.verdict == "converged" and run.complete and run.design.certified == "yes":
         return "good"
@@ -63,7 +63,9 @@ def _everyone(run: Run) -> str:
 def _outcome(run: Run) -> str:
     verdict, error = run.summary.verdict, show(run.summary.tracking_error)
     at = f"t = {show(run.until)} s"
-    cut = "" if run.complete else f"The run was cut off at {at}: "
+    how = "cancelled" if verdict == "cancelled" else "cut off"
+    ended = run.complete or verdict in ("diverged", "failed")  # these end a run by themselves
+    cut = "" if ended else f"The run was {how} at {at}: "
     if not run.time.size:
         return "Nothing was recorded before the run was cut off"
     if verdict == "diverged" or run.first_lost:
@@ -76,7 +78,12 @@ def _outcome(run: Run) -> str:
         close = f"to within {error}" if run.summary.tracking_error else "to the last digit"
         judge = ", as far as the observers tell" if run.x is None else ""
         text = f"{_everyone(run)} reached the leader, {close} at {at}{judge}"
-    elif verdict == "cut off":
+    elif verdict == "failed":
+        text = f"an FMU failed at {at}"
+    elif verdict == "positivity lost":
+        lowest = show(run.summary.min_state)
+        text = f"positivity is lost (lowest state {lowest}), the tracking error is {error} at {at}"
+    elif verdict in ("cut off", "cancelled"):
         text = f"the largest tracking error was {error} by then"
     else:
         text = f"{verdict}: the largest tracking error is {error} at {at}"
@@ -85,7 +92,7 @@ def _outcome(run: Run) -> str:
 
 def _positivity(run: Run) -> str:
     lowest = run.summary.min_state
-    if lowest is None or not run.time.size:
+    if lowest is None or not run.time.size or run.summary.verdict == "positivity lost":
         return ""
     if negative(run):
         return f" and positivity is lost (lowest state {show(lowest)})"
@@ -117,13 +124,16 @@ def _proof(run: Run) -> str:
 def advice(run: Run) -> str:
     """Say what to do next."""
     design = run.design
-    if run.summary.verdict == "diverged" or run.first_lost:
-        if design.protocol == "printed":
-            return (
-                "Do not use this loop. The printed sign of the pinning term feeds the pinned agent "
-                "back positively; use protocol = “corrected”."
-            )
+    diverged = run.summary.verdict == "diverged" or run.first_lost is not None
+    if design.protocol == "printed" and (diverged or negative(run)):
+        return (
+            "Do not use this loop. The printed sign of the pinning term feeds the pinned agent "
+            "back positively; use protocol = “corrected”."
+        )
+    if diverged:
         return "Do not use these gains. Start from the failed conditions of the certificate below."
+    if run.summary.verdict == "failed":
+        return "Look at the FMU that failed; the plots show what was recorded up to then."
     if negative(run):
         return (
             "These gains do not keep the network positive. Use the contraction design, "
@@ -170,9 +180,13 @@ def tiles(run: Run) -> list[tuple[str, str, str, str]]:
     return [
         (
             "Tracking",
-            "diverged" if diverged else summary.verdict,
+            "diverged" if diverged else _tracked(summary.verdict),
             f"largest error {_size(summary.tracking_error, diverged)} {end}",
-            "bad" if diverged else "good" if summary.verdict == "converged" else "caution",
+            "bad"
+            if diverged or summary.verdict == "failed"
+            else "good"
+            if summary.verdict == "converged"
+            else "caution",
         ),
         (
             "Certificate",
@@ -212,6 +226,11 @@ def tiles(run: Run) -> list[tuple[str, str, str, str]]:
     ]
 
 
+def _tracked(verdict: str) -> str:
+    """Positivity has a tile of its own, and hides whether the error was small enough."""
+    return "not judged" if verdict == "positivity lost" else verdict
+
+
 def _size(error: float | None, diverged: bool) -> str:
     return "not finite" if error is None and diverged else show(error)
 
@@ -237,6 +256,16 @@ def sector_statement(run: Run, k: int) -> str:
         share = 100 * outside / ratio.size
         return f"{seen}: {show(share, 2)} % of the samples lie outside {bounds}, against the proof."
     return f"{seen}, inside {bounds}."
+
+
+def baseline_statement(run: Run) -> str:
+    """Compare the last errors with and without control."""
+    if run.baseline_error is None or not run.time.size:
+        return ""
+    own, without = (
+        float(np.abs(error[-1]).max()) for error in (run.tracking_error, run.baseline_error)
+    )
+    return f"At t = {show(run.until)} s: {show(own)} with it, {show(without)} without."
 
 
 def describe(run: Run, values: Array, what: str) -> str:
