@@ -261,3 +261,13 @@ def test_distributed_observer_can_undershoot_so_positivity_is_conditional() -> N
     xhat = np.zeros_like(x)
     rate_of_estimate = L_p @ (x - xhat) @ (loop.E @ agent.C).T
     assert rate_of_estimate[0].max() < 0  # agent 1 hears 2 and 3, and starts at zero
+
+
+def test_decoupled_states_have_entries_that_cannot_fail() -> None:
+    agent = linear_agent([[-1.0, 0.0], [0.0, -2.0]], [[1.0], [0.0]], [[1.0, 0.0], [0.0, 1.0]])
+    network = network_from_arcs(2, [(1, 2)], [1])
+    E = np.diag([0.5, 0.25])
+    loop = Loop(agent, network, np.array([[-0.5, 0.0]]), E, period=0.1)
+    certificate = certify_loop(loop)
+    assert certificate.certified == "yes"
+    assert certificate.rate == pytest.approx(1.2, abs=0.2)

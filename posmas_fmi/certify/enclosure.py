@@ -16,6 +16,8 @@ from posmas_fmi.interval import Interval
 
 _DEGREE = 16  # with ‖X‖ ≤ 1/2 the remainder is below 2e-20
 _MAX_EXPONENT = 600.0  # e^600 is still far from overflow
+_UNDERFLOW = 1e-300  # far above what sums of underflowing products can lose
+_UP = 1 + 2.0**-51
 
 
 def typed(value: Any) -> Interval:
@@ -113,20 +115,50 @@ def exp_nonnegative(P: Interval, times: Array) -> tuple[Interval, Interval]:
     identity = point(np.eye(m)[None])
     exponential, mean = _taylor(X, identity)
     for _ in range(squarings):
-        mean = matmul((exponential + identity) * point(0.5), mean)
-        exponential = matmul(exponential, exponential)
-    return exponential, mean
+        mean = product((exponential + identity) * point(0.5), mean)
+        exponential = product(exponential, exponential)
+    reached = _reached(P)
+    return _masked(exponential, reached), _masked(mean, reached)
+
+
+def _masked(a: Interval, reached: Array) -> Interval:
+    return Interval(a.low, np.where(reached, a.high, 0.0))
+
+
+def _reached(P: Interval) -> Array:
+    """Where a power of P can be non-zero: elsewhere the exponential is exactly zero."""
+    m = P.low.shape[-1]
+    pattern = (P.high > 0) | np.eye(m, dtype=bool)
+    for _ in range(max(1, math.ceil(math.log2(m))) if m > 1 else 0):
+        pattern = pattern.astype(float) @ pattern.astype(float) > 0
+    return pattern
 
 
 def _taylor(X: Interval, identity: Interval) -> tuple[Interval, Interval]:
     """Series of e^X and (e^X - I)/X by Horner's rule for ‖X‖ ≤ 1/2, remainders added above."""
     exponential = mean = identity
     for k in range(_DEGREE, 0, -1):
-        mean = identity + matmul(X, mean) * typed(1.0 / (k + 1)).widen()
-        exponential = identity + matmul(X, exponential) * typed(1.0 / k).widen()
+        mean = identity + _over(product(X, mean), k + 1)
+        exponential = identity + _over(product(X, exponential), k)
     # the first term left out is at most 2^-17/17!, the following ones shrink by 1/36
     remainder = 1.1 * 2.0**-17 / math.factorial(17)
     return _raise(exponential, remainder), _raise(mean, remainder)
+
+
+def product(a: Interval, b: Interval) -> Interval:
+    """Matrix product of non-negative intervals: two products with a relative error bound.
+
+    Exact zeros stay exact: an entry is zero only where every term of its sum is.
+    """
+    roundings = 2 * (a.low.shape[-1] + 2) * 2.0**-53
+    low = np.maximum((a.low @ b.low) * (1 - roundings) - _UNDERFLOW, 0.0)
+    high = (a.high @ b.high) * (1 + roundings)
+    reached = (a.high > 0).astype(float) @ (b.high > 0).astype(float) > 0
+    return Interval(low, np.where(reached, high + _UNDERFLOW, 0.0))
+
+
+def _over(a: Interval, k: int) -> Interval:
+    return Interval(np.nextafter(a.low / k, 0.0), np.where(a.high > 0, a.high / k * _UP, 0.0))
 
 
 def _raise(a: Interval, amount: float) -> Interval:

@@ -11,8 +11,8 @@ from posmas_fmi.certify.enclosure import (
     block,
     exp_nonnegative,
     exp_scalar,
-    matmul,
     point,
+    product,
     shift_of,
     shifted,
 )
@@ -43,18 +43,15 @@ class Flow:
         """Shift that makes both matrices non-negative."""
         return shift_of(self.A_low, self.A_high)
 
-    def shifted_bounds(self, times: Array) -> tuple[Interval, Interval, Interval, Interval]:
-        """``e^{στ}`` times Φ, ``(Φ-e^{-στ}I)/τ``, ``Γ/τ`` low, ``Γ/τ`` high, each (n, m, m).
+    def shifted_bounds(self, times: Array) -> tuple[Interval, Interval, Interval]:
+        """``e^{στ}`` times ``e^{A_low τ}``, ``(e^{A_low τ}-e^{-στ}I)/τ`` and ``Γ_τ(A_high)/τ``.
 
-        Φ is the lower bound ``e^{A_low τ}``. Every one of them increases with τ.
+        Each (n, m, m); every entry increases with τ.
         """
-        m = len(self.A_low.low)
         P = shifted(self.A_low, self.sigma)
         exponential, mean = exp_nonnegative(P, times)
-        increment = _matmul_mean(P, mean)
-        low = self._held(P, times, m)
-        high = self._held(shifted(self.A_high, self.sigma), times, m)
-        return exponential, increment, low, high
+        held = self._held(shifted(self.A_high, self.sigma), times, len(P.low))
+        return exponential, _matmul_mean(P, mean), held
 
     def _held(self, P: Interval, times: Array, m: int) -> Interval:
         """``(1/τ) ∫₀^τ e^{P(τ-s)} e^{σs} ds``, by the exponential of ``[[P, I], [0, σI]]``."""
@@ -86,4 +83,4 @@ def _augmented(P: Interval, sigma: float) -> Interval:
 
 
 def _matmul_mean(P: Interval, mean: Interval) -> Interval:
-    return matmul(Interval(P.low[None], P.high[None]), mean)
+    return product(Interval(P.low[None], P.high[None]), mean)

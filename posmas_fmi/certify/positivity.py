@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from posmas_fmi.certify.certificate import Condition
-from posmas_fmi.certify.enclosure import matmul, point
+from posmas_fmi.certify.enclosure import point, product
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.expression import Array
 from posmas_fmi.interval import Interval
 
+Indices = np.ndarray[Any, np.dtype[np.intp]]
 VACUOUS = 1.0  # margin where there is no entry that could fail
+_FIRST_PIECES = 8
 _MAX_PIECES = 4096
 
 
@@ -87,53 +91,77 @@ def between_samples(flow: Flow, feedback: Feedback, h: float) -> Condition:
     if not flow.metzler or not (feedback.N.low >= 0).all():
         return Condition(name, False, -np.inf, "needs certificate P", feedback.strongest)
     N = feedback.N * point(feedback.strong)
-    off = ~np.eye(len(N.low), dtype=bool)
-    left, right = np.array([0.0]), np.array([h])
-    proved, pieces, index = np.inf, 0, None
-    while True:
-        slack = _slack(flow, N, left, right, off)
-        least = slack.reshape(len(left), -1).min(axis=1)
+    ends = _Ends(flow, N, np.linspace(0.0, h, _FIRST_PIECES + 1))
+    first = np.arange(_FIRST_PIECES)
+    pieces: Indices = np.column_stack([first, first + 1])
+    proved, count = np.inf, 0
+    while len(pieces):
+        slack = ends.slack(pieces[:, 0], pieces[:, 1])
+        least = slack.reshape(len(pieces), -1).min(axis=1)
         good = least >= 0
-        if good.any():
-            proved = min(proved, float(least[good].min()))
-            pieces += int(good.sum())
-        if good.all():
-            break
-        bad_left, bad_right = left[~good], right[~good]
-        middle = 0.5 * (bad_left + bad_right)
-        exact = _slack(flow, N, middle, middle, off)
-        if 2 * len(middle) > _MAX_PIECES or exact.min() < 0:
-            k, *entry = np.unravel_index(int(exact.argmin()), exact.shape)
-            proved, index = min(float(exact.min()), -float(np.finfo(float).tiny)), tuple(entry)
-            tau = float(middle[k])
+        proved, count = min(proved, float(least[good].min(initial=np.inf))), count + int(good.sum())
+        pieces = pieces[~good]
+        corners = np.unique(pieces)
+        exact = ends.slack(corners, corners)
+        if 2 * len(pieces) > _MAX_PIECES or exact.min(initial=np.inf) < 0:
+            k, *entry = (int(i) for i in np.unravel_index(int(exact.argmin()), exact.shape))
+            margin = min(float(exact.min()), -float(np.finfo(float).tiny))
             return Condition(
                 name,
                 False,
-                proved,
-                f"least entry {proved:.6g} at tau = {tau:.6g} s, interval arithmetic",
-                f"{_entry('the matrix', tuple(int(i) for i in index))}; "
-                f"a shorter period or a smaller gain helps; binding at {feedback.strongest}",
+                margin,
+                f"least entry {margin:.6g} at tau = {ends.times[corners[k]]:.6g} s, "
+                "interval arithmetic",
+                f"{_entry('the matrix', tuple(entry))}; a shorter period or a smaller gain "
+                f"helps; binding at {feedback.strongest}",
             )
-        left, right = np.concatenate([bad_left, middle]), np.concatenate([middle, bad_right])
+        pieces = ends.halve(pieces)
     margin = VACUOUS if np.isinf(proved) else max(proved, float(np.finfo(float).tiny))
     return Condition.from_margin(
         name,
         margin,
         f"least entry (off the diagonal per tau) >= {margin:.6g}, "
-        f"{pieces} piece(s) of [0, h], interval arithmetic",
+        f"{count} pieces of [0, h], interval arithmetic",
         f"binding at {feedback.strongest}",
     )
 
 
-def _slack(flow: Flow, N: Interval, left: Array, right: Array, off: Array) -> Array:
-    """Lower bound of both terms' difference on each piece, (n, m, m)."""
-    exponential, increment, _, _ = flow.shifted_bounds(left)
-    *_, held = flow.shifted_bounds(right)
-    taken = matmul(held, Interval(N.low[None], N.high[None])).high
-    own = np.where(off[None], increment.low, exponential.low)
-    with np.errstate(invalid="ignore"):
-        spent = np.where(off[None], taken, np.nextafter(taken * right[:, None, None], np.inf))
-        slack = np.nextafter(own - spent, -np.inf)
-    # nothing is taken from these entries, and e^{A_low τ} ≥ 0
-    slack = np.where(taken == 0, np.inf, slack)
-    return np.nan_to_num(slack, nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+class _Ends:
+    """Both terms at the ends of pieces of [0, h], each computed once."""
+
+    def __init__(self, flow: Flow, N: Interval, times: Array) -> None:
+        self.flow, self.N = flow, N
+        self.off = ~np.eye(len(N.low), dtype=bool)
+        self.times = times
+        self.own, self.spent = self._terms(times)
+
+    def _terms(self, times: Array) -> tuple[Array, Array]:
+        """Lower bound of what is there and upper bound of what feedback takes, (n, m, m)."""
+        exponential, increment, held = self.flow.shifted_bounds(times)
+        taken = product(held, Interval(self.N.low[None], self.N.high[None])).high
+        own = np.where(self.off, increment.low, exponential.low)
+        with np.errstate(invalid="ignore"):
+            whole = np.nextafter(taken * times[:, None, None], np.inf)
+        # nothing is taken from entries that are exactly zero, and e^{A_low τ} ≥ 0
+        spent = np.where(self.off, taken, whole)
+        return own, np.where(taken == 0, -np.inf, np.nan_to_num(spent, nan=np.inf, posinf=np.inf))
+
+    def slack(self, left: Indices, right: Indices) -> Array:
+        """Lower bound of the difference on the pieces between the ends with these numbers."""
+        with np.errstate(invalid="ignore"):
+            difference = np.nextafter(self.own[left] - self.spent[right], -np.inf)
+        return np.asarray(
+            np.nan_to_num(difference, nan=-np.inf, posinf=np.inf, neginf=-np.inf), dtype=float
+        )
+
+    def halve(self, pieces: Indices) -> Indices:
+        """Add the middles of pieces as new ends; return the halves."""
+        middle = 0.5 * (self.times[pieces[:, 0]] + self.times[pieces[:, 1]])
+        new = len(self.times) + np.arange(len(pieces))
+        own, spent = self._terms(middle) if len(pieces) else (self.own[:0], self.spent[:0])
+        self.times = np.concatenate([self.times, middle])
+        self.own = np.concatenate([self.own, own])
+        self.spent = np.concatenate([self.spent, spent])
+        return np.concatenate(
+            [np.column_stack([pieces[:, 0], new]), np.column_stack([new, pieces[:, 1]])]
+        )

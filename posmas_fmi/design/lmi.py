@@ -27,7 +27,7 @@ from posmas_fmi.design.gains import certified
 from posmas_fmi.design.result import Design
 from posmas_fmi.design.rounding import nearest
 from posmas_fmi.design.settings import DesignSettings
-from posmas_fmi.design.solver import solve
+from posmas_fmi.design.solver import cvxpy, solve
 from posmas_fmi.errors import DesignError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
@@ -146,8 +146,7 @@ def _bisect(
     network: Network, sector: tuple[float, float], start: tuple[float, Array, Array]
 ) -> tuple[float, Array, Array]:
     """Bisection over γ with free Θ and T."""
-    import cvxpy as cp
-
+    cp = cvxpy()
     M = network.pinned_laplacian.toarray()
     n = network.N
     mean, half = 0.5 * (sector[1] + sector[0]), 0.5 * (sector[1] - sector[0])
@@ -221,8 +220,7 @@ def feedback_gain(
     DesignError
         If not even a negative κ is found.
     """
-    import cvxpy as cp
-
+    cp = cvxpy()
     m, A, H, B = agent.m, agent.A, agent.H, agent.B
     beta = lipschitz_norm(agent)
     if not np.isfinite(beta):
@@ -365,8 +363,7 @@ def observer_gain(agent: Agent, rate: float, digits: int) -> tuple[Array, float,
     DesignError
         If no positive observer has that rate.
     """
-    import cvxpy as cp
-
+    cp = cvxpy()
     m, q, A, H, C = agent.m, agent.q, agent.A, agent.H, agent.C
     beta = lipschitz_norm(agent)
     p, s, W = cp.Variable(m, pos=True), cp.Variable(pos=True), cp.Variable((m, q))

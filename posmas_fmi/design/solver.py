@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 from posmas_fmi.errors import DesignError
 
 _USABLE = ("optimal", "optimal_inaccurate")
+
+
+def cvxpy() -> Any:
+    """Import cvxpy where it is needed: it costs more than a second."""
+    return import_module("cvxpy")
 
 
 def solve(problem: Any, what: str) -> bool:
@@ -28,8 +34,7 @@ def solve(problem: Any, what: str) -> bool:
     DesignError
         If the solver breaks down.
     """
-    import cvxpy as cp
-
+    cp = cvxpy()
     try:
         problem.solve(solver=cp.CLARABEL)
     except cp.error.SolverError as error:
