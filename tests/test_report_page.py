@@ -202,6 +202,7 @@ def test_cut_off_run_says_so_without_a_summary(tmp_path: Path) -> None:
     folder = cut_off(tmp_path, steps=400)
     run = read_run(folder)
     assert run.time.size == 400
+    assert run.summary.steps == 399
     text = _Page(page_of(folder)).text
     assert "The run was cut off at t = 2 s" in text
     error = np.abs(run.x[-1] - run.s[-1]).max()

@@ -65,7 +65,7 @@ def _derived_summary(run: Run) -> Summary:
         ),
         min_state=number(np.nanmin(run.x)) if run.x is not None and run.x.size else None,
         wall_s=None,
-        steps=max(len(run.time) - 1, 0) * run.stride,
+        steps=round((run.until - run.time[0]) / run.period) if run.period and run.time.size else 0,
         comparison={},
         notes=(),
     )
