@@ -64,11 +64,14 @@ class Recorder:
         attributes: dict[str, Any],
     ) -> None:
         import h5netcdf
+        import h5py
 
         self._layout = layout
         self._rows: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
         self._written: dict[str, int] = dict.fromkeys(self._rows, 0)
-        self._file = h5netcdf.File(path, "w")
+        # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
+        self._disk = h5py.File(path, "w", track_order=True)
+        self._file = h5netcdf.File(self._disk, "a")
         self._define(network, variables, attributes)
 
     def _define(
@@ -102,7 +105,7 @@ class Recorder:
                 name, ("time", *dimensions), float, chunks=_chunks(sizes), fillvalue=np.nan
             )
         file.attrs.update({**attributes, "complete": 0})
-        file.flush()
+        self._disk.flush()
 
     def record(self, time: float, values: dict[str, Array]) -> None:
         """Add one row; the arrays are copied. A variable that is left out stays NaN there."""
@@ -126,7 +129,7 @@ class Recorder:
                 self._file.variables[name][self._written[name] : ends[name]] = np.stack(rows)
                 rows.clear()
         self._written = ends
-        self._file.flush()
+        self._disk.flush()
 
     @property
     def rows(self) -> int:
@@ -142,6 +145,7 @@ class Recorder:
         """Write the rest and close the file; `complete` stays as it is."""
         self.flush()
         self._file.close()
+        self._disk.close()
 
     def __enter__(self) -> Recorder:
         return self

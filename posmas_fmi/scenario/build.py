@@ -173,7 +173,7 @@ class _Builder:
                 )
         x0 = xhat0 = s0 = None
         if agent and network and clock:
-            random = np.random.default_rng(tables.scenario.seed)
+            random = np.random.default_rng(abs(tables.scenario.seed))
             n, m = network.N, agent.m
             x0 = self.attempt(lambda: initial(tables.initial.x, n, m, random, "$.initial.x"))
             xhat0 = self.attempt(

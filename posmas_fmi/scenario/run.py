@@ -76,6 +76,7 @@ def run(
     folder: Path,
     progress: Callable[[str], Progress | None] = lambda label: None,
     command: str = "",
+    report: bool = True,
 ) -> RunResult:
     """Run a scenario and write everything to a folder.
 
@@ -88,6 +89,8 @@ def run(
         Gets a label, returns a progress function for that part or None.
     command : str, optional
         For the manifest.
+    report : bool, optional
+        Whether to write report.html as well.
 
     Returns
     -------
@@ -117,7 +120,8 @@ def run(
         summary["baseline"] = {key: without[key] for key in keys}
     summary["wall_s"] = round(time.perf_counter() - began, 3)
     _write_json(folder / "summary.json", summary)
-    write_report(folder)
+    if report:
+        write_report(folder)
     return RunResult(folder, designed, summary)
 
 

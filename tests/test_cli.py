@@ -1,0 +1,145 @@
+import json
+import subprocess
+import sys
+
+import pytest
+
+from posmas_fmi import resources
+from posmas_fmi.cli import main
+
+SHORT = ["run", "paper_example_1", "--until", "0.1"]
+
+
+def test_run_prints_its_verdict_and_writes_its_folder(tmp_path, capsys):
+    code = main([*SHORT, "--out", str(tmp_path / "a"), "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["certified"] == "conditional"
+    assert (tmp_path / "a" / "report.html").is_file()
+    # 0.1 s is too short to converge: a negative verdict
+    assert (code, printed["verdict"]) == (1, "not converged")
+
+
+def test_the_default_folder_is_named_after_the_scenario(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(SHORT)
+    assert (tmp_path / "out" / "paper-example-1" / "results.nc").is_file()
+    assert "out/paper-example-1/report.html" in capsys.readouterr().out.replace("\\", "/")
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [("paper_example_1", 0), ("paper_example_1_printed", 1), ("paper_example_2_printed", 1)],
+)
+def test_exit_codes_of_the_main_job(tmp_path, capsys, name, code):
+    assert main(["run", name, "--out", str(tmp_path)]) == code
+    assert capsys.readouterr().err == ""
+
+
+def test_design_prints_the_contract(capsys):
+    assert main(["design", "paper_example_1_tanh", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["certified"] == "yes"
+    for key in ("method", "K", "E", "assumptions", "rate", "observer_rate", "positive", "pinned"):
+        assert key in printed
+    assert {"name", "holds", "margin", "proof"} <= set(printed["conditions"][0])
+    assert {"name", "status", "detail"} <= set(printed["assumptions"][0])
+
+
+def test_certify_judges_given_gains(tmp_path, capsys):
+    gains = tmp_path / "gains.json"
+    gains.write_text('{"K": [[-0.441, -0.441]], "E": [[-0.1724, 3.7982], [3.7982, 3.0183]]}')
+    assert main(["certify", "paper_example_1", "--gains", str(gains), "--json"]) in (0, 1)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["K"] == [[-0.441, -0.441]]
+    gains.write_text('{"K": [[0.441, 0.441]], "E": [[0.0, 9.0], [0.0, 9.0]]}')
+    assert main(["certify", "paper_example_1", "--gains", str(gains)]) == 1
+    assert "FAILS" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"K": 1}', '{"K": "a", "E": "b"}', '{"K": [[1]], "E": [[1]]}']
+)
+def test_certify_refuses_what_are_no_gains(tmp_path, capsys, content):
+    gains = tmp_path / "gains.json"
+    gains.write_text(content)
+    assert main(["certify", "paper_example_1", "--gains", str(gains)]) == 2
+    assert capsys.readouterr().err.startswith("posmas-fmi: ")
+
+
+def test_report_is_made_again_from_what_is_stored(tmp_path, capsys):
+    main([*SHORT, "--out", str(tmp_path)])
+    first = (tmp_path / "report.html").read_bytes()
+    (tmp_path / "report.html").unlink()
+    assert main(["report", str(tmp_path)]) == 0
+    assert (tmp_path / "report.html").read_bytes() == first
+    assert main(["report", str(tmp_path / "nothing")]) == 2
+    capsys.readouterr()
+
+
+def test_models_lists_what_ships(capsys):
+    assert main(["models"]) == 0
+    printed = capsys.readouterr().out
+    for path in resources.shipped("models").glob("*.toml"):
+        assert path.stem in printed
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "paper_exmple_1"],
+        ["run", "missing.toml"],
+        ["run", "."],
+        ["design", "missing.toml"],
+        ["certify", "paper_example_1", "--gains", "missing.json"],
+        ["run", "paper_example_1", "--until", "0.0001"],
+        ["run", "paper_example_1", "--seed", "-1"],
+        ["check", "some.fmu"],
+        ["linearise", "some.fmu", "--in", "u", "--out", "y"],
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(capsys, arguments):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("posmas-fmi: ")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["dance"],
+        ["run"],
+        ["run", "paper_example_1", "--until", "-3"],
+        ["design", "x", "--method", "y"],
+    ],
+)
+def test_bad_arguments_are_exit_code_2(capsys, arguments):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys, contextlib, io\n"
+        "from posmas_fmi.cli import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):\n"
+        "    main(['--help'])\n"
+        "heavy = {'numpy', 'sympy', 'scipy', 'cvxpy', 'control', 'matplotlib', 'fmpy'}\n"
+        "print(sorted(heavy & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_design_by_contraction_imports_no_solver_of_lmis():
+    code = (
+        "import sys\n"
+        "from posmas_fmi.cli import main\n"
+        "main(['design', 'paper_example_1', '--json'])\n"
+        "print(sorted({'cvxpy', 'matplotlib', 'fmpy', 'control'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
