@@ -116,21 +116,28 @@ def _models(arguments: argparse.Namespace) -> int:
 
 
 def _fmu_build(arguments: argparse.Namespace) -> int:
-    from posmas_fmi.fmu.shipped import build
+    from posmas_fmi.fmu.build import build_plants
 
-    for path in build(arguments.names):
+    if sys.stderr.isatty():
+        print("building; the first build for another system takes minutes", file=sys.stderr)
+    for path in build_plants(arguments.names, arguments.out):
         print(path)
     return DONE
 
 
 def _regress(arguments: argparse.Namespace) -> int:
+    import attrs
+
     from posmas_fmi.fmu.compare import regress
 
     result = regress(arguments.fmu, arguments.reference)
+    rows = [attrs.asdict(deviation) for deviation in result.deviations]
     if arguments.json:
-        _print_json(result.to_dict())
+        _print_json({"passed": result.passed, "variables": rows})
     else:
-        print(result)
+        for row in rows:
+            print("  ".join(f"{key} {_cell(value)}" for key, value in row.items()))
+        print("passed" if result.passed else "FAILED: outside the band of the reference")
     return DONE if result.passed else NEGATIVE
 
 
@@ -174,6 +181,10 @@ def _certified(made: Design) -> str:
     if certificate.certified == "no":
         return f"no ({'; '.join(c.name for c in certificate.failing)})"
     return certificate.certified
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _number(value: float | None) -> str:
@@ -271,14 +282,15 @@ def _parser() -> argparse.ArgumentParser:
     fmu = add("fmu", _fmu_build, "build the shipped FMUs")
     actions = fmu.add_subparsers(required=True, metavar="ACTION")
     build = actions.add_parser("build", help="(re)build the shipped FMUs")
-    build.add_argument("names", nargs="*", metavar="NAME")
+    build.add_argument("names", nargs="*", metavar="NAME", help="default: all")
+    build.add_argument("--out", type=Path, default=Path("fmus"), help="folder (default fmus)")
 
     regress = add("regress", _regress, "compare an FMU with a reference result")
     regress.add_argument("fmu", type=Path)
     regress.add_argument("reference", type=Path, metavar="REFERENCE.csv")
     regress.add_argument("--json", action="store_true")
 
-    paper = add("paper", _not_built("paper"), "what the paper prints against what is true")
+    paper = add("paper", _not_built("paper"), "the ledger of the paper (not in this version yet)")
     paper.add_argument("--json", action="store_true")
     for name, text in (
         ("check", "preflight of any FMU"),

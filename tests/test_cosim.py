@@ -112,6 +112,22 @@ def test_nonlinear_part_is_of_fourth_order():
     assert (orders > 3.7).all(), (errors, orders)
 
 
+@pytest.mark.parametrize("example", [1, 2])
+def test_one_step_of_the_observer_is_within_1e_6_of_the_flow(example):
+    """What docs/certificates.md says: the certificate takes this step as exact."""
+    agent, h, rng = paper.agent(example), 0.005, np.random.default_rng(0)
+    step, worst = Propagator.of(agent, h), 0.0
+    for _ in range(100):
+        x, w, t0 = rng.uniform(0, 4, 2), rng.uniform(-5, 5, 2), rng.uniform(0, 10)
+
+        def rhs(t, z, w=w):
+            return agent.A @ z + agent.H @ agent.g_numpy(t, z[None])[0] + w
+
+        exact = solve_ivp(rhs, (t0, t0 + h), x, "DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+        worst = max(worst, np.abs(step(t0, x[None], w[None])[0] - exact).max())
+    assert worst < 1e-6
+
+
 # ---- clock --------------------------------------------------------------------------------------
 
 

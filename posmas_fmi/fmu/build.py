@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from posmas_fmi import resources
-from posmas_fmi.errors import BuildError
+from posmas_fmi.errors import BuildError, InputError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.compile import (
     FLAGS,
@@ -207,13 +207,15 @@ def build_plants(
 
     Raises
     ------
+    InputError
+        If there is no such plant.
     BuildError
-        If there is no such plant, or it cannot be built.
+        If one cannot be built.
     """
     plants = shipped_plants()
     for name in names:
         if name not in plants:
-            raise BuildError(f"there is no plant {name!r}; shipped: {', '.join(plants)}")
+            raise InputError(f"there is no plant {name!r}; shipped: {', '.join(plants)}")
     paths = []
     for name in names or plants:
         model = read_plant(plants[name])

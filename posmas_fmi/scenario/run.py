@@ -109,7 +109,8 @@ def run(
     _make_folder(folder)
     for name in ("summary.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
-    _write_json(folder / "design.json", designed.to_dict())
+    facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
+    _write_json(folder / "design.json", facts)
     _write_json(folder / "manifest.json", manifest(scenario, files, command))
     began = time.perf_counter()
     outcome, baseline = _simulate(scenario, designed, files, folder, progress)

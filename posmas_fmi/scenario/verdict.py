@@ -32,6 +32,8 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
             "name": name,
             "status": _status(outcome, k, name, tolerance),
             "final_error": _finite(outcome.tracking_error[k]),
+            "converged": bool(outcome.tracking_error[k] <= tolerance),
+            "non_negative": bool(outcome.min_state[k] >= NEGATIVE),
             "min_state": _finite(outcome.min_state[k]),
             "min_time": _finite(outcome.min_time[k]),
         }
