@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from posmas_fmi.expression import Array
-from posmas_fmi.interval import Interval
+from posmas_fmi.interval import Interval, Mask
 
 _DEGREE = 16  # with ‖X‖ ≤ 1/2 the remainder is below 2e-20
 _MAX_EXPONENT = 600.0  # e^600 is still far from overflow
@@ -121,11 +121,11 @@ def exp_nonnegative(P: Interval, times: Array) -> tuple[Interval, Interval]:
     return _masked(exponential, reached), _masked(mean, reached)
 
 
-def _masked(a: Interval, reached: Array) -> Interval:
+def _masked(a: Interval, reached: Mask) -> Interval:
     return Interval(a.low, np.where(reached, a.high, 0.0))
 
 
-def _reached(P: Interval) -> Array:
+def _reached(P: Interval) -> Mask:
     """Where a power of P can be non-zero: elsewhere the exponential is exactly zero."""
     m = P.low.shape[-1]
     pattern = (P.high > 0) | np.eye(m, dtype=bool)

@@ -75,6 +75,8 @@ def flows(A: Array, h: float) -> tuple[Array, Array]:
     from scipy.linalg import expm
 
     m = len(A)
+    if not np.abs(A).max() * h < 1e4:  # beyond it nothing is left to sample
+        return np.full((m, m), np.nan), np.full((m, m), np.nan)
     W = expm(np.block([[A, np.eye(m)], [np.zeros((m, 2 * m))]]) * h)
     return W[:m, :m], W[:m, m:]
 
@@ -100,6 +102,8 @@ def alternate(
         None where not even the first program is feasible.
     """
     lines = _Constraints(problem)
+    if not lines.finite:
+        return None
     starts = [v] if v is not None else [np.ones(len(problem.A_low)), perron_vector(problem.A_high)]
     best: Solution | None = None
     best_value = np.inf
@@ -135,6 +139,8 @@ class _Constraints:
             self.base, self.pull = flows(problem.A_high, h)[0], flows(problem.A_low, h)[1]
         self.rows, self.limits, self.soft = self._signs()
         self.fixed = self._zeros()
+        parts = (self.base, self.pull, self.rows, self.limits)
+        self.finite = all(bool(np.isfinite(part).all()) for part in parts)
 
     def entries(self, left: Array) -> Array:
         """Coefficients of ``(left · problem.left) X right`` entry by entry, (m, m, count)."""
