@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import attrs
 import numpy as np
@@ -125,3 +126,61 @@ class Mailbox:
             self.stamp[chosen[newer]] = sent_at
         self.held = held
         return held
+
+
+@attrs.define(eq=False)
+class Arrivals:
+    """What a `Mailbox` with the same seed would deliver, step after step, without the contents.
+
+    Parameters
+    ----------
+    channel : Channel
+    random : numpy.random.Generator
+
+    Attributes
+    ----------
+    lost : (steps,) array of int
+        Messages lost in each step of the last draw.
+    """
+
+    channel: Channel
+    random: np.random.Generator
+    lost: np.ndarray[tuple[int], np.dtype[np.int64]] = attrs.field(init=False)
+    _stamp: np.ndarray[tuple[int], np.dtype[np.int64]] = attrs.field(init=False)
+    _due: dict[int, list[tuple[np.ndarray[Any, np.dtype[np.intp]], int]]] = attrs.field(
+        factory=dict, init=False
+    )
+
+    def __attrs_post_init__(self) -> None:
+        self._stamp = np.full(len(self.channel.delay), -1)
+        self.lost = np.zeros(0, dtype=np.int64)
+
+    def draw(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+        """Return the age of the message taken at each step and arc, -1 where none is.
+
+        Parameters
+        ----------
+        begin, end : int
+            Steps, end not included; begin where the last draw ended.
+
+        Returns
+        -------
+        (end - begin, arcs) array of int
+        """
+        arcs = len(self._stamp)
+        ages = np.full((end - begin, arcs), -1, dtype=np.int32)
+        self.lost = np.zeros(end - begin, dtype=np.int64)
+        for row, k in enumerate(range(begin, end)):
+            # the same two draws as in Mailbox.exchange
+            arrives = self.random.random(arcs) >= self.channel.loss
+            due = k + self.channel.delay + self.random.integers(0, self.channel.jitter + 1)
+            self.lost[row] = arcs - int(arrives.sum())
+            for when in np.unique(due[arrives]):
+                self._due.setdefault(int(when), []).append(
+                    (np.flatnonzero(arrives & (due == when)), k)
+                )
+            for chosen, sent_at in self._due.pop(k, []):
+                newer = chosen[self._stamp[chosen] < sent_at]
+                self._stamp[newer] = sent_at
+                ages[row, newer] = k - sent_at
+        return ages

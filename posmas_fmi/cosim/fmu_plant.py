@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,36 +12,15 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import FmuCallError, FmuError, InputError
+from posmas_fmi.cosim import native
+from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap
+from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
 
+log = logging.getLogger(__name__)
 
-@attrs.frozen
-class PortMap:
-    """Which FMU variables carry a protocol vector: FMU value = scale × value + offset.
-
-    Attributes
-    ----------
-    variables : tuple of str
-    scale, offset : tuple of float
-    units : tuple of (str or None)
-        Checked against the FMU's description where given.
-    place : str
-        Where in the scenario they are declared.
-    """
-
-    variables: tuple[str, ...]
-    scale: tuple[float, ...]
-    offset: tuple[float, ...]
-    units: tuple[str | None, ...]
-    place: str
-
-    @classmethod
-    def plain(cls, variables: Sequence[str], place: str = "") -> PortMap:
-        """Ports without conversion."""
-        n = len(variables)
-        return cls(tuple(variables), (1.0,) * n, (0.0,) * n, (None,) * n, place)
+__all__ = ["FmuPlant", "PlantSpec", "PortMap"]
 
 
 @attrs.frozen
@@ -89,63 +70,74 @@ class FmuPlant:
         states: PortMap | None,
         stop: float,
     ) -> None:
-        self._agents = tuple(agents)
-        self._inputs, self._outputs, self._states = inputs, outputs, states
+        self._inputs = inputs
+        self._readings = outputs if states is None else outputs + states
+        self._q, self._shows_states = len(outputs.variables), states is not None
+        self._time = 0.0
+        self._last: Array | None = None
+        library = _compiled_loop()
+        messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
-            self._files = {spec.fmu: None for spec in specs}
-            files = {path: stack.enter_context(FmuFile(path)) for path in self._files}
+            paths = dict.fromkeys(spec.fmu for spec in specs)
+            files = {path: stack.enter_context(FmuFile(path, messages)) for path in paths}
             for file in files.values():
                 for ports in (inputs, outputs, states):
                     if ports is not None:
                         _check_ports(file, ports)
             self._instances = [
-                stack.enter_context(self._start(files[spec.fmu], name, spec, stop))
+                stack.enter_context(_start(files[spec.fmu], name, spec, stop))
                 for name, spec in zip(agents, specs, strict=True)
             ]
-            self._ports = [
-                _Ports.of(file, inputs, outputs, states)
-                for file in (files[spec.fmu] for spec in specs)
-            ]
+            self.fmus = Fmus(self._instances, inputs, self._readings, messages)
             self._release = stack.pop_all()
+        self._loop = None
+        if library is not None:
+            self._loop = FmuLoop(self.fmus, library, len(self._readings.variables))
 
-    def _start(self, file: FmuFile, agent: str, spec: PlantSpec, stop: float) -> FmuInstance:
-        instance = file.instantiate(agent)
-        try:
-            instance.initialise(_existing(file, spec.values), stop=stop)
-        except FmuCallError as error:
-            raise FmuCallError(error.message, error.where, agent, error.time) from error
-        return instance
+    @property
+    def shows_states(self) -> bool:
+        """Whether `states` returns x."""
+        return self._shows_states
 
     def outputs(self) -> Array:
         """Return y, (N, q)."""
-        return self._read("outputs", self._outputs)
+        return self._read()[:, : self._q]
 
     def states(self) -> Array | None:
         """Return x, (N, m), if the FMU shows it."""
-        return None if self._states is None else self._read("states", self._states)
+        return self._read()[:, self._q :] if self._shows_states else None
 
-    def _read(self, kind: str, ports: PortMap) -> Array:
-        scale, offset = np.array(ports.scale), np.array(ports.offset)
-        values = np.empty((len(self._instances), len(ports.variables)))
-        for k, instance in enumerate(self._instances):
-            try:
-                values[k] = instance.read(getattr(self._ports[k], kind))
-            except FmuCallError as error:
-                raise self._named(error, k) from error
+    def _read(self) -> Array:
+        """Return outputs and states; FMUs are asked once per communication point."""
+        if self._last is None:
+            if self._loop is not None:
+                self._last = self._loop.read(self._time)
+            else:
+                self._last = self._read_one_by_one()
+        return self._last
+
+    def _read_one_by_one(self) -> Array:
+        scale, offset = np.array(self._readings.scale), np.array(self._readings.offset)
+        names = self._readings.variables
+        values = np.array([i.read(i.file.ports(names)) for i in self._instances])
         return np.asarray((values - offset) / scale)
 
     def step(self, k: int, t: float, h: float, U: Array) -> None:
         """Set the inputs of every FMU and let it step."""
-        values = U * np.array(self._inputs.scale) + np.array(self._inputs.offset)
-        for i, instance in enumerate(self._instances):
-            try:
-                instance.write(self._ports[i].inputs, values[i])
+        self._last = None
+        if self._loop is not None:
+            self._loop.step(t, h, U)
+        else:
+            values = U * np.array(self._inputs.scale) + np.array(self._inputs.offset)
+            for row, instance in zip(values, self._instances, strict=True):
+                instance.write(instance.file.ports(self._inputs.variables), row)
                 instance.do_step(t, h)
-            except FmuCallError as error:
-                raise self._named(error, i) from error
+        self._time = t + h
 
-    def _named(self, error: FmuCallError, k: int) -> FmuCallError:
-        return FmuCallError(error.message, error.where, self._agents[k], error.time)
+    def stepped_to(self, time: float) -> None:
+        """Take note that the engine has taken the FMUs to this time [s]."""
+        self._time, self._last = time, None
+        self.fmus.set_time(time)
 
     def close(self) -> None:
         """Free instances, libraries and temporary folders."""
@@ -158,19 +150,18 @@ class FmuPlant:
         self.close()
 
 
-@attrs.frozen(eq=False)
-class _Ports:
-    inputs: Any
-    outputs: Any
-    states: Any
+def _compiled_loop() -> ctypes.CDLL | None:
+    try:
+        return native.load(native.library(native.fmus_sources()))
+    except BuildError as error:
+        log.info("FMUs are called one by one from Python: %s", error)
+        return None
 
-    @classmethod
-    def of(cls, file: FmuFile, inputs: PortMap, outputs: PortMap, states: PortMap | None) -> _Ports:
-        return cls(
-            file.ports(inputs.variables),
-            file.ports(outputs.variables),
-            None if states is None else file.ports(states.variables),
-        )
+
+def _start(file: FmuFile, agent: str, spec: PlantSpec, stop: float) -> FmuInstance:
+    instance = file.instantiate(agent)
+    instance.initialise(_existing(file, spec.values), stop=stop)
+    return instance
 
 
 def _check_ports(file: FmuFile, ports: PortMap) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NoReturn
 
 import attrs
@@ -240,9 +240,7 @@ class _Run:
                 row["x"] = x
             self.record(t, row)
         truth = state.xhat if x is None else x
-        with np.errstate(invalid="ignore", over="ignore"):
-            self.tracking = np.abs(truth - state.s).max(axis=1)
-            self.estimation = np.abs(truth - state.xhat).max(axis=1)
+        self.tracking, self.estimation = errors_at(truth, state.xhat, state.s)
         if state.k == 0:
             self.largest_initial = float(self.tracking.max())
             scale = max(np.abs(truth).max(), np.abs(state.s).max(), np.abs(state.xhat).max(), 1.0)
@@ -256,10 +254,18 @@ class _Run:
             self._diverged(t, size)
 
     def _diverged(self, t: float, size: Array) -> NoReturn:
-        worst = int(np.nanargmax(np.where(np.isfinite(size), size, np.inf)))
-        name = self.system.network.names[worst]
-        raise _Stop(
-            "diverged",
-            f"agent {name} passed {self.limit:.3g} at t = {t:.6g} s; the run ends there",
-            name,
-        )
+        name, reason = diverged_reason(self.system.network.names, size, self.limit, t)
+        raise _Stop("diverged", reason, name)
+
+
+def errors_at(truth: Array, xhat: Array, s: Array) -> tuple[Array, Array]:
+    """Largest modulus over the states of tracking and of estimation error, (N,) each."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.abs(truth - s).max(axis=1), np.abs(truth - xhat).max(axis=1)
+
+
+def diverged_reason(names: Sequence[str], size: Array, limit: float, t: float) -> tuple[str, str]:
+    """Name of the agent that is furthest beyond the limit, and the reason for the outcome."""
+    worst = int(np.nanargmax(np.where(np.isfinite(size), size, np.inf)))
+    name = names[worst]
+    return name, f"agent {name} passed {limit:.3g} at t = {t:.6g} s; the run ends there"

@@ -151,7 +151,11 @@ def buildable(fmi: int) -> list[str]:
 
 
 def shared_library(
-    files: Mapping[str, str], compiled: Sequence[str], name: str, target: Platform
+    files: Mapping[str, str],
+    compiled: Sequence[str],
+    name: str,
+    target: Platform,
+    flags: Sequence[str] = (),
 ) -> bytes:
     """Compile a shared library.
 
@@ -164,6 +168,8 @@ def shared_library(
     name : str
         Of the library, without extension.
     target : Platform
+    flags : sequence of str, optional
+        Given to the compiler after `FLAGS`.
 
     Returns
     -------
@@ -180,7 +186,7 @@ def shared_library(
         for file, text in files.items():
             Path(folder, file).write_text(text, encoding="utf-8", newline="\n")
         output = name + target.extension
-        command = [*compiler.arguments(target), "-o", output, *compiled, "-lm"]
+        command = [*compiler.arguments(target), *flags, "-o", output, *compiled, "-lm"]
         _LOG.info("compiling %s for %s: %s", name, target.name, shlex.join(command))
         try:
             run = subprocess.run(

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 import attrs
 import numpy as np
@@ -30,6 +30,22 @@ _KEPT_MESSAGES = 20
 _LONGEST_MESSAGE = 2000
 
 
+class Messages(Protocol):
+    """Where the messages of instances go, told apart by their keys."""
+
+    def logger(self, version: int) -> int:
+        """Address of the function that FMUs of this FMI version call."""
+
+    def environment(self, key: int) -> int:
+        """Return what the instance gives to that function."""
+
+    def forget(self, key: int) -> None:
+        """Leave out what the instance has said so far."""
+
+    def of(self, key: int) -> list[str]:
+        """Return the last few messages of the instance."""
+
+
 class FmuFile:
     """An FMU unpacked and loaded once, for any number of Co-Simulation instances.
 
@@ -37,6 +53,8 @@ class FmuFile:
     ----------
     path : path-like
         The .fmu file.
+    messages : Messages, optional
+        Where the messages of its instances go; kept by Python functions if left out.
 
     Attributes
     ----------
@@ -65,7 +83,9 @@ class FmuFile:
     and the temporary folder. What is forgotten is released when the object is collected.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    kind = "Co-Simulation"
+
+    def __init__(self, path: str | Path, messages: Messages | None = None) -> None:
         self.path = Path(path)
         folder = tempfile.TemporaryDirectory(prefix="posmas-fmi-", ignore_cleanup_errors=True)
         try:
@@ -73,9 +93,9 @@ class FmuFile:
         except BaseException:
             folder.cleanup()
             raise
-        self._keys = itertools.count(1)
+        self._messages = messages or _PythonMessages()
         self._live: dict[int, _Live] = {}
-        self._callbacks = _callbacks(self.version, self._live)
+        self._known_ports: dict[tuple[str, ...], Ports] = {}
         self._close = weakref.finalize(
             self, _release, self._live, self._frees, self._fmu.freeLibrary, folder
         )
@@ -91,8 +111,9 @@ class FmuFile:
             raise ArchiveError(f"cannot read modelDescription.xml: {error}", where) from error
         if description.fmiVersion != "2.0" and not description.fmiVersion.startswith("3."):
             raise FmuError(f"expected FMI 2.0 or 3.0 (got {description.fmiVersion})", where)
-        if description.coSimulation is None:
-            raise FmuError("expected a Co-Simulation interface (it has none)", where)
+        interface = self._interface(description)
+        if interface is None:
+            raise FmuError(f"expected a {self.kind} interface (it has none)", where)
         self.version: Literal[2, 3] = 2 if description.fmiVersion == "2.0" else 3
         self.description = description
         self.token = str(description.guid)
@@ -101,12 +122,21 @@ class FmuFile:
         }
         self._variables = Variables(self.variables, where)
         self._folder = folder
-        self._load(str(description.coSimulation.modelIdentifier))
+        self._load(str(interface.modelIdentifier))
+
+    def _interface(self, description: Any) -> Any:
+        """Return what the description says about the interface used; None if it has none."""
+        return description.coSimulation
+
+    def _binding(self) -> Any:
+        """Return FMPy's class for the binary."""
+        from fmpy.fmi2 import FMU2Slave
+        from fmpy.fmi3 import FMU3Slave
+
+        return FMU2Slave if self.version == 2 else FMU3Slave
 
     def _load(self, identifier: str) -> None:
         import fmpy
-        from fmpy.fmi2 import FMU2Slave
-        from fmpy.fmi3 import FMU3Slave
 
         where = str(self.path)
         if not identifier.isidentifier():
@@ -120,10 +150,10 @@ class FmuFile:
             raise FmuError(
                 f"expected {name} among the binaries for {binaries} (the FMU has {has})", where
             )
-        slave: Any = FMU2Slave if self.version == 2 else FMU3Slave
+        binding = self._binding()
         before = os.getcwd()
         try:
-            self._fmu: Any = slave(
+            self._fmu: Any = binding(
                 guid=self.token, modelIdentifier=identifier, unzipDirectory=str(self._folder)
             )
         except Exception as error:  # FMPy raises bare exceptions here
@@ -175,16 +205,21 @@ class FmuFile:
         """
         if self.closed:
             raise FmuError("the file is closed", str(self.path))
-        key = next(self._keys)
-        live = self._live[key] = _Live(self._callbacks(key))
+        key = next(_KEYS)
+        live = self._live[key] = _Live(
+            self._messages, _callbacks(self.version, self._messages, key)
+        )
         live.component = self._instantiate(name, key, live.callbacks) or 0
         if not live.component:
             del self._live[key]
             raise FmuCallError(
-                _said("the FMU returned no instance", live.messages),
+                _said("the FMU returned no instance", self._messages.of(key)),
                 f"{self.path.name}: {name}: fmi{self.version}Instantiate",
                 name,
             )
+        return self._made(name, key)
+
+    def _made(self, name: str, key: int) -> FmuInstance:
         return FmuInstance(self, name, key)
 
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
@@ -202,7 +237,7 @@ class FmuFile:
                 *(text, token, self._resources),
                 *(False, False),  # neither visible nor debug logging
                 *(False, False, None, 0),  # no event mode, early return, intermediate variables
-                *(key, callbacks, fmi3IntermediateUpdateCallback()),
+                *(self._messages.environment(key), callbacks, fmi3IntermediateUpdateCallback()),
             )
             function = "fmi3InstantiateCoSimulation"
         component: int | None = self._functions[function](*arguments)
@@ -234,7 +269,10 @@ class FmuFile:
 
     def ports(self, names: Iterable[str]) -> Ports:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""
-        return self._variables.ports(names)
+        key = tuple(names)
+        if key not in self._known_ports:
+            self._known_ports[key] = self._variables.ports(key)
+        return self._known_ports[key]
 
 
 class FmuInstance:
@@ -251,6 +289,8 @@ class FmuInstance:
         Where the last successful step ended [s].
     component : int
         Address of the instance, for callers that are not Python.
+    key : int
+        Tells the instance apart from all others, in its messages.
 
     Raises
     ------
@@ -263,13 +303,12 @@ class FmuInstance:
         self.file = file
         self.name = name
         self.time = 0.0
-        self._key = key
+        self.key = key
         self._live = file._live[key]
         self.component = self._live.component
         self._prefix = f"fmi{file.version}"
         self._real = "Real" if file.version == 2 else "Float64"
         self._state = "FMUstate" if file.version == 2 else "FMUState"
-        self._ports: dict[str, Ports] = {}
         self._free = weakref.finalize(self, _free_instance, file._live, key, file._frees)
 
     def __enter__(self) -> Self:
@@ -290,28 +329,56 @@ class FmuInstance:
     @property
     def messages(self) -> tuple[str, ...]:
         """What the instance logged during the last call, the last few lines."""
-        return tuple(self._live.messages)
+        return tuple(self.file._messages.of(self.key))
 
     def _call(self, function: str, *arguments: Any) -> None:
-        if self._key not in self.file._live:
-            raise self._error(function, "the instance was freed")
-        self._live.messages.clear()
+        if self.key not in self.file._live:
+            raise self.error(function, "the instance was freed")
+        self.file._messages.forget(self.key)
         status = self.file._functions[self._prefix + function](self.component, *arguments)
         if status == 0:
             return
         if status == 1:
-            _LOG.warning("%s", _said(f"{self._where(function)} warns", self.messages))
+            self.warn(function, self.messages)
             return
+        raise self.status_error(function, status, self.messages)
+
+    def warn(self, function: str, messages: Iterable[str]) -> None:
+        """Log that a call returned Warning; parameters as `status_error`."""
+        _LOG.warning("%s", _said(f"{self._where(function)} warns", messages))
+
+    def status_error(self, function: str, status: int, messages: Iterable[str]) -> FmuCallError:
+        """Return the error for a status other than OK and Warning.
+
+        Parameters
+        ----------
+        function : str
+            Without the prefix: ``DoStep``.
+        status : int
+            As the FMU returned it.
+        messages : iterable of str
+            What the instance said during the call.
+        """
         label = _STATUS[status] if 0 <= status < len(_STATUS) else "outside the standard"
-        raise self._error(function, _said(f"returned status {status} ({label})", self.messages))
+        return self.error(function, _said(f"returned status {status} ({label})", messages))
 
     def _where(self, function: str) -> str:
         return f"{self.file.path.name}: {self.name}: {self._prefix}{function}"
 
-    def _error(self, function: str, message: str) -> FmuCallError:
+    def error(self, function: str, message: str) -> FmuCallError:
+        """Return an error with the FMU, the instance, the call and the time."""
         return FmuCallError(
             f"{message} (at time {self.time:g} s)", self._where(function), self.name, self.time
         )
+
+    def ended_early(self, terminates: bool, reached: float) -> FmuCallError:
+        """Return the error for a step that did not get to its end."""
+        what = "asked to end the simulation" if terminates else "returned early"
+        return self.error("DoStep", f"{what} at {reached!r} s")
+
+    def not_finite(self, port: str, value: float) -> FmuCallError:
+        """Return the error for a value that is not finite."""
+        return self.error(f"Get{self._real}", f"{port} is not finite ({value:g})")
 
     # ---- life -----------------------------------------------------------------------------------
 
@@ -379,8 +446,7 @@ class FmuInstance:
             by = ctypes.byref
             self._call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
             if terminate.value or early.value:
-                what = "asked to end the simulation" if terminate.value else "returned early"
-                raise self._error("DoStep", f"{what} at {last.value!r} s")
+                raise self.ended_early(terminate.value, last.value)
         self.time = time + step
 
     def terminate(self) -> None:
@@ -407,8 +473,7 @@ class FmuInstance:
         chosen: Array = values[ports.places]
         if not np.isfinite(chosen).all():
             k = int(np.flatnonzero(~np.isfinite(chosen))[0])
-            what = f"{ports.names[k]} is not finite ({chosen[k]:g})"
-            raise self._error(f"Get{self._real}", what)
+            raise self.not_finite(ports.names[k], chosen[k])
         return chosen
 
     def write(self, ports: Ports, values: ArrayLike) -> None:
@@ -433,7 +498,7 @@ class FmuInstance:
         variable, index = self.file._variables.resolve(name)
         if variable.type in WHOLE:
             return self._whole("Get", variable, 0)
-        values = self.read(self._known_ports(name))
+        values = self.read(self.file.ports((name,)))
         if index is not None or not variable.shape:
             return float(values[0])
         return values.reshape(variable.shape)
@@ -446,6 +511,7 @@ class FmuInstance:
         FmuError
             If a name is unknown or a shape wrong.
         """
+        real: dict[str, Array] = {}  # all in one call
         for name, value in values.items():
             variable, index = self.file._variables.resolve(name)
             if variable.type in WHOLE:
@@ -455,12 +521,9 @@ class FmuInstance:
             shape = () if index is not None else variable.shape
             if given.shape != shape and given.shape != (math.prod(shape),):
                 raise FmuError(f"expected {name!r} of shape {shape} (got {given.shape})", self.name)
-            self.write(self._known_ports(name), given)
-
-    def _known_ports(self, name: str) -> Ports:
-        if name not in self._ports:
-            self._ports[name] = self.file.ports((name,))
-        return self._ports[name]
+            real[name] = given.reshape(-1)
+        if real:
+            self.write(self.file.ports(real), np.concatenate(list(real.values())))
 
     def _whole(self, direction: str, variable: Variable, value: int) -> int:
         """Get or set an integer, Boolean or enumeration."""
@@ -580,13 +643,16 @@ class FmuState:
 # ---- what is alive in the binary, and how it is released -----------------------------------------
 
 
+_KEYS = itertools.count(1)
+
+
 @attrs.define(eq=False)
 class _Live:
-    """An instance as the binary knows it; the callbacks must live as long."""
+    """An instance as the binary knows it; what it calls back must live as long."""
 
+    messages: Messages
     callbacks: Any
     component: int = 0
-    messages: deque[str] = attrs.field(factory=lambda: deque(maxlen=_KEPT_MESSAGES))
     states: dict[int, ctypes.c_void_p] = attrs.field(factory=dict)
 
 
@@ -610,6 +676,7 @@ def _free_instance(instances: dict[int, _Live], key: int, frees: _Frees) -> None
     for handle in list(live.states.values()):
         _free_state(live, handle, frees)
     frees.instance(live.component)
+    live.messages.forget(key)
 
 
 def _release(
@@ -624,20 +691,44 @@ def _release(
     folder.cleanup()
 
 
-def _callbacks(version: int, instances: dict[int, _Live]) -> Any:
-    """Return a function that makes the callbacks of an instance, told apart by its key."""
+class _PythonMessages:
+    """Messages kept by Python functions."""
 
-    def keep(environment: int | None, message: bytes | None) -> None:
-        live = instances.get(environment or 0)
-        if live is not None:
+    def __init__(self) -> None:
+        from fmpy.fmi2 import fmi2CallbackLoggerTYPE
+        from fmpy.fmi3 import fmi3LogMessageCallback
+
+        kept: dict[int, deque[str]] = {}  # the functions must not keep self alive
+
+        def keep(key: int | None, message: bytes | None) -> None:
             text = (message or b"")[:_LONGEST_MESSAGE].decode("utf-8", "replace")
-            live.messages.append(text)
+            kept.setdefault(key or 0, deque(maxlen=_KEPT_MESSAGES)).append(text)
 
+        self._kept = kept
+        self._functions = {
+            2: fmi2CallbackLoggerTYPE(lambda key, _n, _s, _c, text: keep(key, text)),
+            3: fmi3LogMessageCallback(lambda key, _s, _c, text: keep(key, text)),
+        }
+
+    def logger(self, version: int) -> int:
+        return int(ctypes.cast(self._functions[version], ctypes.c_void_p).value or 0)
+
+    def environment(self, key: int) -> int:
+        return key
+
+    def forget(self, key: int) -> None:
+        self._kept.pop(key, None)
+
+    def of(self, key: int) -> list[str]:
+        return list(self._kept.get(key, ()))
+
+
+def _callbacks(version: int, messages: Messages, key: int) -> Any:
+    """Return what an instance gets to call back; none of it goes through Python by itself."""
     if version == 3:
         from fmpy.fmi3 import fmi3LogMessageCallback
 
-        log3 = fmi3LogMessageCallback(lambda environment, _s, _c, text: keep(environment, text))
-        return lambda _key: log3
+        return fmi3LogMessageCallback(messages.logger(3))
 
     from fmpy import calloc, free
     from fmpy.fmi2 import (
@@ -647,20 +738,12 @@ def _callbacks(version: int, instances: dict[int, _Live]) -> Any:
         fmi2CallbackLoggerTYPE,
     )
 
-    log2 = fmi2CallbackLoggerTYPE(lambda environment, _n, _s, _c, text: keep(environment, text))
-    # The C functions themselves: no way through Python on every allocation.
-    allocate = ctypes.cast(calloc, fmi2CallbackAllocateMemoryTYPE)
-    release = ctypes.cast(free, fmi2CallbackFreeMemoryTYPE)
-
-    def make(key: int) -> Any:
-        functions = fmi2CallbackFunctions()
-        functions.logger = log2
-        functions.allocateMemory = allocate
-        functions.freeMemory = release
-        functions.componentEnvironment = key
-        return functions
-
-    return make
+    functions = fmi2CallbackFunctions()
+    functions.logger = fmi2CallbackLoggerTYPE(messages.logger(2))
+    functions.allocateMemory = ctypes.cast(calloc, fmi2CallbackAllocateMemoryTYPE)
+    functions.freeMemory = ctypes.cast(free, fmi2CallbackFreeMemoryTYPE)
+    functions.componentEnvironment = messages.environment(key)
+    return functions
 
 
 def _said(message: str, messages: Iterable[str]) -> str:

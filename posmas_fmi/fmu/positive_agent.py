@@ -84,7 +84,7 @@ def positive_agent(
     )
     code = {
         "model.c": _TEMPLATE.read_text(encoding="utf-8"),
-        "agent_functions.h": _functions(g, sec, m, p, q),
+        "agent_functions.h": functions_header(g, sec, m, p, q),
     }
     description = "Positive agent x' = A x + H g(t, x) + B sec(u), y = C x"
     return FmuModel(name, description, variables, code, experiment or Experiment())
@@ -111,8 +111,17 @@ def _check(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -> No
             raise BuildError(f"component {k + 1} depends on {sorted(map(str, others))}", "sec")
 
 
-def _functions(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -> str:
-    """``agent_functions.h``: the sizes, g and sec, and their slopes."""
+def functions_header(
+    g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int, slopes: bool = True
+) -> str:
+    """Return ``agent_functions.h``: the sizes M, P, Q, g and sec in C, and their slopes.
+
+    Raises
+    ------
+    BuildError
+        If g or sec do not fit the sizes, or component k of sec depends on another input.
+    """
+    _check(g, sec, m, p, q)
     states = {"t": "t"} | {f"x{k + 1}": f"x[{k}]" for k in range(m)}
     inputs = {f"u{k + 1}": f"u[{k}]" for k in range(p)}
     own_slopes = tuple(
@@ -139,6 +148,8 @@ def _functions(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -
             inputs,
         ),
     ]
+    if not slopes:
+        parts = [part for part in parts if part[3] != "slope"]
     lines = [
         "/* g and sec of model (1) and their slopes, generated from the agent's expressions. */",
         "#ifndef AGENT_FUNCTIONS_H",

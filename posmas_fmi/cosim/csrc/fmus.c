@@ -1,0 +1,152 @@
+/* Calls into FMUs: every status and every value that is read is checked. */
+#include "fmus.h"
+
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "export.h"
+
+typedef int Get2(void *, const uint32_t[], size_t, double[]);
+typedef int Set2(void *, const uint32_t[], size_t, const double[]);
+typedef int Step2(void *, double, double, int);
+typedef int Get3(void *, const uint32_t[], size_t, double[], size_t);
+typedef int Set3(void *, const uint32_t[], size_t, const double[], size_t);
+typedef int Step3(void *, double, double, bool, bool *, bool *, bool *, double *);
+
+enum { OK, WARNING };
+
+static int64_t said(const Fmus *f)
+{
+    return f->messages ? __atomic_load_n(&f->messages->written, __ATOMIC_ACQUIRE) : 0;
+}
+
+static int fail(Report *report, Incident incident)
+{
+    if (!report->failure.call || incident_before(&incident, &report->failure))
+        report->failure = incident;
+    return 0;
+}
+
+/* Whether the status lets the run go on. */
+static int check(int status, Incident incident, Report *report)
+{
+    if (status == OK)
+        return 1;
+    incident.status = status;
+    if (status != WARNING)
+        return fail(report, incident);
+    if (!report->warnings++)
+        report->warning = incident;
+    return 1;
+}
+
+static int get(const Binding *b, void *component, const Ports *p, double *values)
+{
+    size_t n = (size_t)p->n_references;
+    if (b->fmi == 2)
+        return ((Get2 *)b->get)(component, p->references, n, values);
+    return ((Get3 *)b->get)(component, p->references, n, values, (size_t)p->n_values);
+}
+
+static int set(const Binding *b, void *component, const Ports *p, const double *values)
+{
+    size_t n = (size_t)p->n_references;
+    if (b->fmi == 2)
+        return ((Set2 *)b->set)(component, p->references, n, values);
+    return ((Set3 *)b->set)(component, p->references, n, values, (size_t)p->n_values);
+}
+
+static int write(const Fmus *f, const Binding *b, int64_t agent, const double *values,
+                 double *scratch, Report *report)
+{
+    const Ports *p = &b->inputs;
+    void *component = f->component[agent];
+    Incident incident = {CALL_SET, agent, 0, 0, 0, said(f)};
+    if (p->places || p->scale) {
+        if (p->partial) {
+            incident.call = CALL_GET_BEFORE_SET;
+            if (!check(get(b, component, p, scratch), incident, report))
+                return 0;
+            incident.call = CALL_SET;
+            incident.said = said(f);
+        }
+        for (int64_t k = 0; k < p->n_ports; k++)
+            scratch[p->places ? p->places[k] : k] =
+                p->scale ? values[k] * p->scale[k] + p->offset[k] : values[k];
+        values = scratch;
+    }
+    return check(set(b, component, p, values), incident, report);
+}
+
+int fmus_step(const Fmus *f, int64_t agent, double t, double h, const double *values,
+              double *scratch, Report *report)
+{
+    const Binding *b = &f->bindings[f->binding[agent]];
+    void *component = f->component[agent];
+    if (!write(f, b, agent, values, scratch, report))
+        return 0;
+    Incident incident = {CALL_STEP, agent, 0, 0, 0, said(f)};
+    if (b->fmi == 2)
+        return check(((Step2 *)b->do_step)(component, t, h, 0), incident, report);
+    bool event = false, terminate = false, early = false;
+    double reached = t;
+    int status =
+        ((Step3 *)b->do_step)(component, t, h, false, &event, &terminate, &early, &reached);
+    if (!check(status, incident, report))
+        return 0;
+    if (!terminate && !early)
+        return 1;
+    incident.call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
+    incident.value = reached;
+    return fail(report, incident);
+}
+
+int fmus_read(const Fmus *f, int64_t agent, double *values, double *scratch, Report *report)
+{
+    const Binding *b = &f->bindings[f->binding[agent]];
+    const Ports *p = &b->readings;
+    const int direct = !p->places && !p->scale;
+    double *to = direct ? values : scratch;
+    Incident incident = {CALL_GET, agent, 0, 0, 0, said(f)};
+    if (!check(get(b, f->component[agent], p, to), incident, report))
+        return 0;
+    for (int64_t k = 0; k < p->n_ports; k++) {
+        double value = direct ? values[k] : scratch[p->places ? p->places[k] : k];
+        if (!isfinite(value)) {
+            incident.call = CALL_NOT_FINITE;
+            incident.port = k;
+            incident.value = value;
+            return fail(report, incident);
+        }
+        if (!direct)
+            values[k] = p->scale ? (value - p->offset[k]) / p->scale[k] : value;
+    }
+    return 1;
+}
+
+int incident_before(const Incident *a, const Incident *b)
+{
+    const int a_read = a->call >= CALL_GET, b_read = b->call >= CALL_GET;
+    return a_read != b_read ? b_read : a->agent < b->agent;
+}
+
+/* ---- all agents in one call, for a loop that is not in C ------------------------------------- */
+
+EXPORT void fmus_step_all(const Fmus *f, double t, double h, const double *inputs, double *scratch,
+                          Report *report)
+{
+    for (int64_t i = 0; i < f->n; i++)
+        if (!fmus_step(f, i, t, h, inputs + i * f->bindings[f->binding[i]].inputs.n_ports, scratch,
+                       report))
+            return;
+}
+
+EXPORT void fmus_read_all(const Fmus *f, double *readings, double *scratch, Report *report)
+{
+    for (int64_t i = 0; i < f->n; i++)
+        if (!fmus_read(f, i, readings + i * f->bindings[f->binding[i]].readings.n_ports, scratch,
+                       report))
+            return;
+}

@@ -1,0 +1,78 @@
+/* The FMU instances of all agents, FMI 2 and 3: set the inputs, step, read outputs and states. */
+#ifndef FMUS_H
+#define FMUS_H
+
+#include <stdint.h>
+
+#include "message_log.h"
+
+/* Every member has 8 bytes, so that the structures are the same in any language. */
+
+/* Places of protocol quantities among the values that one call of the FMU exchanges. */
+typedef struct {
+    const uint32_t *references;
+    int64_t n_references;
+    int64_t n_values;       /* that a call exchanges */
+    int64_t n_ports;        /* that are wanted among them */
+    const int64_t *places;  /* of the ports among the values; NULL: one after the other */
+    const double *scale;    /* FMU value = scale * value + offset; NULL: as it is */
+    const double *offset;
+    int64_t partial;        /* some of the values are no ports: they are read before setting */
+} Ports;
+
+/* The functions of one FMU file and its ports. */
+typedef struct {
+    int64_t fmi; /* 2 or 3 */
+    void (*get)(void);
+    void (*set)(void);
+    void (*do_step)(void);
+    Ports inputs;
+    Ports readings; /* outputs y, then states x where they are shown */
+} Binding;
+
+typedef struct {
+    int64_t n;                  /* agents */
+    const Binding *bindings;
+    const int64_t *binding;     /* of each agent */
+    void *const *component;     /* of each agent */
+    int64_t room;               /* values in the largest exchange */
+    const MessageLog *messages; /* NULL: kept elsewhere */
+} Fmus;
+
+typedef enum {
+    CALL_NONE,
+    CALL_SET,
+    CALL_GET_BEFORE_SET,
+    CALL_STEP,
+    CALL_STEP_TERMINATED, /* the FMU asked to end the simulation */
+    CALL_STEP_EARLY,      /* FMI 3: returned early */
+    CALL_GET,
+    CALL_NOT_FINITE /* a value that was read */
+} Call;
+
+/* Which call was not right. */
+typedef struct {
+    int64_t call; /* one of Call */
+    int64_t agent;
+    int64_t status;
+    int64_t port;  /* which value is not finite */
+    double value;  /* it, or the time that a step got to */
+    int64_t said;  /* number of messages before the call */
+} Incident;
+
+typedef struct {
+    Incident failure;  /* call is CALL_NONE: none */
+    Incident warning;  /* the first one */
+    int64_t warnings;
+} Report;
+
+/* Both return whether all went well; `values` has the ports, `scratch` room for an exchange. */
+int fmus_step(const Fmus *fmus, int64_t agent, double t, double h, const double *values,
+              double *scratch, Report *report);
+int fmus_read(const Fmus *fmus, int64_t agent, double *values, double *scratch, Report *report);
+
+/* Of two failures in one communication step, whether `a` is the one that a loop over all agents
+ * that steps, and then one that reads, meets first. */
+int incident_before(const Incident *a, const Incident *b);
+
+#endif

@@ -1,0 +1,362 @@
+"""FMU instances as the C loops see them: calls, ports, messages; and what went wrong, as errors."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.errors import FmuCallError
+from posmas_fmi.expression import Array
+from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.variables import Ports
+
+_LOG = logging.getLogger(__name__)
+
+_int, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+@attrs.frozen
+class PortMap:
+    """Which FMU variables carry a protocol vector: FMU value = scale × value + offset.
+
+    Attributes
+    ----------
+    variables : tuple of str
+    scale, offset : tuple of float
+    units : tuple of (str or None)
+        Checked against the FMU's description where given.
+    place : str
+        Where in the scenario they are declared.
+    """
+
+    variables: tuple[str, ...]
+    scale: tuple[float, ...]
+    offset: tuple[float, ...]
+    units: tuple[str | None, ...]
+    place: str
+
+    @classmethod
+    def plain(cls, variables: Sequence[str], place: str = "") -> PortMap:
+        """Ports without conversion."""
+        n = len(variables)
+        return cls(tuple(variables), (1.0,) * n, (0.0,) * n, (None,) * n, place)
+
+    def __add__(self, other: PortMap) -> PortMap:
+        return PortMap(
+            self.variables + other.variables,
+            self.scale + other.scale,
+            self.offset + other.offset,
+            self.units + other.units,
+            self.place,
+        )
+
+    @property
+    def converts(self) -> bool:
+        """Whether the FMU's values are not those of the protocol."""
+        return any(s != 1.0 for s in self.scale) or any(b != 0.0 for b in self.offset)
+
+
+# ---- the structures of csrc/fmus.h and csrc/message_log.h ----------------------------------------
+
+
+class _Ports(ctypes.Structure):
+    _fields_ = (
+        ("references", _pointer),
+        ("n_references", _int),
+        ("n_values", _int),
+        ("n_ports", _int),
+        ("places", _pointer),
+        ("scale", _pointer),
+        ("offset", _pointer),
+        ("partial", _int),
+    )
+
+
+class _Binding(ctypes.Structure):
+    _fields_ = (
+        ("fmi", _int),
+        ("get", _pointer),
+        ("set", _pointer),
+        ("do_step", _pointer),
+        ("inputs", _Ports),
+        ("readings", _Ports),
+    )
+
+
+class _Fmus(ctypes.Structure):
+    _fields_ = (
+        ("n", _int),
+        ("bindings", _pointer),
+        ("binding", _pointer),
+        ("component", _pointer),
+        ("room", _int),
+        ("messages", _pointer),
+    )
+
+
+class _Incident(ctypes.Structure):
+    _fields_ = (
+        ("call", _int),
+        ("agent", _int),
+        ("status", _int),
+        ("port", _int),
+        ("value", _double),
+        ("said", _int),
+    )
+
+
+class Report(ctypes.Structure):
+    """What the C loops say about the calls of FMUs; ``failure.call`` is 0 where there is none."""
+
+    _fields_ = (("failure", _Incident), ("warning", _Incident), ("warnings", _int))
+
+
+_CALLS = {1: "Set", 2: "Get", 3: "DoStep", 4: "DoStep", 5: "DoStep", 6: "Get", 7: "Get"}
+_TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
+
+_KEPT, _LONGEST = 64, 1016
+
+
+class _Message(ctypes.Structure):
+    _fields_ = (("sender", _int), ("text", ctypes.c_char * _LONGEST))
+
+
+class _MessageLog(ctypes.Structure):
+    _fields_ = (("written", _int), ("busy", _int), ("message", _Message * _KEPT))
+
+
+class _Sender(ctypes.Structure):
+    _fields_ = (("log", _pointer), ("key", _int))
+
+
+class NativeMessages:
+    """Messages kept by C functions; implements `posmas_fmi.fmu.instance.Messages`.
+
+    Parameters
+    ----------
+    library : ctypes.CDLL
+        Of `posmas_fmi.cosim.native.fmus_sources`.
+    """
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library = library
+        self._log = _MessageLog()
+        self._senders: dict[int, _Sender] = {}
+        self._begin: dict[int, int] = {}
+
+    @property
+    def address(self) -> int:
+        """Where the C loops find it."""
+        return ctypes.addressof(self._log)
+
+    def logger(self, version: int) -> int:
+        """Address of the function that FMUs of this FMI version call."""
+        function = getattr(self._library, f"message_log_fmi{version}")
+        return int(ctypes.cast(function, _pointer).value or 0)
+
+    def environment(self, key: int) -> int:
+        """Return what the instance gives to that function."""
+        sender = self._senders.setdefault(key, _Sender(self.address, key))
+        return ctypes.addressof(sender)
+
+    def forget(self, key: int) -> None:
+        """Leave out what the instance has said so far."""
+        self._begin[key] = self._log.written
+
+    def of(self, key: int) -> list[str]:
+        """Return the last few messages of the instance."""
+        return self.since(key, self._begin.get(key, 0))
+
+    def since(self, key: int, begin: int) -> list[str]:
+        """Return those of its messages that came after the first `begin` of all, if still kept."""
+        written = self._log.written
+        kept = (self._log.message[k % _KEPT] for k in range(max(begin, written - _KEPT), written))
+        return [m.text.decode("utf-8", "replace") for m in kept if m.sender == key]
+
+
+# ---- the instances -------------------------------------------------------------------------------
+
+
+class Fmus:
+    """The FMU instances of all agents with their ports.
+
+    Parameters
+    ----------
+    instances : sequence of FmuInstance
+        Initialised; one per agent. They must outlive this object.
+    inputs, readings : PortMap
+        What is set before and read after each step.
+    messages : NativeMessages, optional
+        Where the instances log, if not in Python.
+    """
+
+    def __init__(
+        self,
+        instances: Sequence[FmuInstance],
+        inputs: PortMap,
+        readings: PortMap,
+        messages: NativeMessages | None = None,
+    ) -> None:
+        self._instances = tuple(instances)
+        self._messages = messages
+        self._keep: list[Any] = []  # what the structures point to
+        files = list(dict.fromkeys(instance.file for instance in instances))
+        number = {file: k for k, file in enumerate(files)}
+        self.names = {file: file.ports(readings.variables).names for file in files}
+        bindings = (_Binding * len(files))(*(self._bind(f, inputs, readings) for f in files))
+        places = np.array([number[instance.file] for instance in instances], dtype=np.int64)
+        components = np.array([instance.component for instance in instances], dtype=np.uintp)
+        self._keep += [bindings, places, components]
+        rooms = [max(b.inputs.n_values, b.readings.n_values) for b in bindings]
+        self.room = -(-max(rooms) // 8) * 8  # whole cache lines
+        self.structure = _Fmus(
+            len(instances),
+            ctypes.addressof(bindings),
+            places.ctypes.data,
+            components.ctypes.data,
+            self.room,
+            messages.address if messages else None,
+        )
+
+    def _bind(self, file: FmuFile, inputs: PortMap, readings: PortMap) -> _Binding:
+        prefix, real = f"fmi{file.version}", "Real" if file.version == 2 else "Float64"
+        return _Binding(
+            file.version,
+            file.address(f"{prefix}Get{real}"),
+            file.address(f"{prefix}Set{real}"),
+            file.address(f"{prefix}DoStep"),
+            self._c_ports(file.ports(inputs.variables), inputs),
+            self._c_ports(file.ports(readings.variables), readings),
+        )
+
+    def _c_ports(self, ports: Ports, port_map: PortMap) -> _Ports:
+        n = len(ports.names)
+        in_order = ports.size == n and bool((ports.places == np.arange(n)).all())
+        places = None if in_order else ports.places.astype(np.int64)
+        scale = offset = None
+        if port_map.converts:
+            scale, offset = np.array(port_map.scale), np.array(port_map.offset)
+        self._keep += [ports, places, scale, offset]
+
+        def address(array: Any) -> int | None:
+            return None if array is None else array.ctypes.data
+
+        return _Ports(
+            ctypes.addressof(ports.references),
+            len(ports.references),
+            ports.size,
+            n,
+            address(places),
+            address(scale),
+            address(offset),
+            ports.partial,
+        )
+
+    @property
+    def address(self) -> int:
+        """Where the C loops find the structure."""
+        return ctypes.addressof(self.structure)
+
+    def set_time(self, time: float) -> None:
+        """Tell the instances where the C loops have taken them [s]."""
+        for instance in self._instances:
+            instance.time = time
+
+    def warn(self, report: Report, time: float) -> None:
+        """Log the first of the calls that returned Warning, if any, and how many there were."""
+        if not report.warnings:
+            return
+        instance, function, messages = self._call_of(report.warning, time)
+        instance.warn(function, messages)
+        if report.warnings > 1:
+            _LOG.warning("%d more calls of FMUs returned Warning", report.warnings - 1)
+
+    def error(self, report: Report, time: float) -> FmuCallError:
+        """Return the failure of a report as an error; the run stood at `time` [s]."""
+        failure = report.failure
+        instance, function, messages = self._call_of(failure, time)
+        if failure.call in (_TERMINATED, _EARLY):
+            return instance.ended_early(failure.call == _TERMINATED, failure.value)
+        if failure.call == _NOT_FINITE:
+            return instance.not_finite(self.names[instance.file][failure.port], failure.value)
+        return instance.status_error(function, failure.status, messages)
+
+    def _call_of(self, incident: Any, time: float) -> tuple[FmuInstance, str, Sequence[str]]:
+        instance = self._instances[incident.agent]
+        instance.time = time
+        function = _CALLS[incident.call]
+        if function != "DoStep":
+            function += "Real" if instance.file.version == 2 else "Float64"
+        messages: Sequence[str] = instance.messages
+        if self._messages is not None:
+            messages = self._messages.since(instance.key, incident.said)
+        return instance, function, messages
+
+
+class FmuLoop:
+    """All FMUs stepped and read by one call each: for a loop that is written in Python.
+
+    Parameters
+    ----------
+    fmus : Fmus
+    library : ctypes.CDLL
+        Of `posmas_fmi.cosim.native.fmus_sources`.
+    width : int
+        Number of readings of each agent.
+    """
+
+    def __init__(self, fmus: Fmus, library: ctypes.CDLL, width: int) -> None:
+        self._fmus = fmus
+        self._step, self._read = library.fmus_step_all, library.fmus_read_all
+        self._step.argtypes = [_pointer, _double, _double, _pointer, _pointer, _pointer]
+        self._read.argtypes = [_pointer, _pointer, _pointer, _pointer]
+        self._step.restype = self._read.restype = None
+        self._scratch = np.zeros(fmus.room)
+        self._shape = (fmus.structure.n, width)
+
+    def step(self, t: float, h: float, inputs: Array) -> None:
+        """Set the inputs (N, p) of every FMU and let it step.
+
+        Raises
+        ------
+        FmuCallError
+            For the first FMU that fails; those after it have not stepped.
+        """
+        values, report = np.ascontiguousarray(inputs, dtype=float), Report()
+        self._step(
+            self._fmus.address,
+            t,
+            h,
+            values.ctypes.data,
+            self._scratch.ctypes.data,
+            ctypes.addressof(report),
+        )
+        self._check(report, t)
+
+    def read(self, t: float) -> Array:
+        """Return the readings (N, width).
+
+        Raises
+        ------
+        FmuCallError
+            For the first FMU that fails.
+        """
+        values, report = np.empty(self._shape), Report()
+        self._read(
+            self._fmus.address,
+            values.ctypes.data,
+            self._scratch.ctypes.data,
+            ctypes.addressof(report),
+        )
+        self._check(report, t)
+        return values
+
+    def _check(self, report: Report, time: float) -> None:
+        self._fmus.warn(report, time)
+        if report.failure.call:
+            raise self._fmus.error(report, time)
