@@ -18,6 +18,7 @@ from posmas_fmi.errors import NetworkError
 from posmas_fmi.expression import Array
 
 DENSE_LIMIT = 2000  # agents up to which dense O(N³) algorithms are used
+DIRECT_LIMIT = 300  # agents up to which a sparse factorisation is never too expensive
 
 
 @attrs.frozen(eq=False)
@@ -146,8 +147,25 @@ class Network:
         NetworkError
             If an agent cannot be reached from the leader.
         """
+        return self.solve(np.ones(self.N))
+
+    def solve(self, b: Array) -> Array:
+        """Solve ``L_p x = b``, (N,).
+
+        Above `DIRECT_LIMIT` agents first by a Krylov method, which digraphs without structure
+        suit and where a factorisation would fill up; what does not converge is factorised.
+
+        Raises
+        ------
+        NetworkError
+            If an agent cannot be reached from the leader.
+        """
         self.require_reached()
-        return np.asarray(spla.spsolve(sp.csc_array(self.pinned_laplacian), np.ones(self.N)))
+        if self.N > DIRECT_LIMIT:
+            x = _krylov(self.pinned_laplacian, b)
+            if x is not None:
+                return x
+        return np.asarray(spla.spsolve(sp.csc_array(self.pinned_laplacian), b))
 
     @property
     def p_max(self) -> float:
@@ -192,6 +210,17 @@ class Network:
         d = np.zeros(self.N)
         d[list(pinned)] = weight
         return attrs.evolve(self, pinning=d)
+
+
+def _krylov(L_p: sp.csr_array, b: Array, iterations: int = 60) -> Array | None:
+    """Solution by BiCGSTAB with the diagonal as preconditioner; None if it did not converge."""
+    diagonal = L_p.diagonal()
+    scaling = spla.LinearOperator(L_p.shape, lambda x: x / diagonal)
+    with np.errstate(all="ignore"):
+        x, _ = spla.bicgstab(L_p, b, rtol=1e-12, maxiter=iterations, M=scaling)
+        residual = float(np.abs(L_p @ x - b).max())
+    # the method's own residual drifts: only the true one counts
+    return np.asarray(x) if residual <= 1e-8 * float(np.abs(b).max()) else None
 
 
 def generalised_connectivity(M: Any, f: Array) -> float:

@@ -152,7 +152,8 @@ def product(a: Interval, b: Interval) -> Interval:
     """
     roundings = 2 * (a.low.shape[-1] + 2) * 2.0**-53
     low = np.maximum((a.low @ b.low) * (1 - roundings) - _UNDERFLOW, 0.0)
-    high = (a.high @ b.high) * (1 + roundings)
+    with np.errstate(invalid="ignore", over="ignore"):
+        high = np.nan_to_num((a.high @ b.high) * (1 + roundings), nan=np.inf, posinf=np.inf)
     reached = (a.high > 0).astype(float) @ (b.high > 0).astype(float) > 0
     return Interval(low, np.where(reached, high + _UNDERFLOW, 0.0))
 

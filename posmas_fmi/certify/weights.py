@@ -15,7 +15,7 @@ import scipy.sparse.linalg as spla
 
 from posmas_fmi.certify.proof import UNIT
 from posmas_fmi.expression import Array
-from posmas_fmi.network import Network
+from posmas_fmi.network import DIRECT_LIMIT, Network
 
 _STEPS = 200  # of inverse iteration; the bound holds after any number of them
 
@@ -78,11 +78,13 @@ def perron_weights(network: Network) -> Weights:
     Where the digraph is not strongly connected the iteration tends to a vector with zeros: it
     stops at the best λ that is proved on the way.
     """
-    network.require_reached()
-    solve = spla.splu(sp.csc_array(network.pinned_laplacian)).solve
+    solve = network.solve
+    if network.N <= DIRECT_LIMIT:
+        network.require_reached()
+        solve = spla.splu(sp.csc_array(network.pinned_laplacian)).solve
     best = p_weights(network)
     nu, gained = best.nu, 0.0
-    for _ in range(_STEPS if network.N <= 2000 else 30):
+    for _ in range(_STEPS if network.N <= 2000 else 10):
         nu = solve(nu)
         nu = nu / nu.max()
         if not (nu > 1e-12).all():
