@@ -486,7 +486,9 @@ def _sector_of(
     if sympy.simplify(expr.subs(u, 0)) != 0:
         return direct
     low, high = region
-    near, far = 2.0**-6, 2.0**10
+    size = max(abs(low), abs(high))
+    size = size if 0 < size < math.inf else 1.0  # inputs come in W as well as in units of 1
+    near, far = size * 2.0**-6, size * 2.0**10
     pieces = [bounds(sympy.diff(expr, u), {name: (max(low, -near), min(high, near))}, claim)]
     edges = [-math.inf, -far, -near, near, far, math.inf]
     for a, b in pairwise(edges):

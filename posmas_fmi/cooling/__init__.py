@@ -1,0 +1,1 @@
+"""The liquid-cooling domain: line physics, mapping to model (1), loads, limits, key figures."""
