@@ -13,7 +13,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.interval import Interval
 
 _SWEEPS = 50
-_MARGIN = 1e-6  # the band is widened by this much to absorb the solver's error
+_MARGIN = 1e-6  # of the disturbance: what absorbs the solver's error and rounding
 
 
 def guaranteed_band(loop: Loop, disturbance: Array) -> Array | None:
@@ -41,20 +41,20 @@ def guaranteed_band(loop: Loop, disturbance: Array) -> Array | None:
         return None
     T, push = ends
     load = (w @ push.T).ravel()
+    wider = load * (1 + _MARGIN) + _MARGIN * load.max(initial=0.0)
     choice = np.zeros(n * m, dtype=bool)
     z = np.zeros(n * m)
     for _ in range(_SWEEPS):
         chosen = sp.csr_array(
             sp.diags_array(~choice * 1.0) @ T[0] + sp.diags_array(choice * 1.0) @ T[1]
         )
-        z = np.asarray(spla.spsolve(sp.csc_array(sp.eye_array(n * m) - chosen), load))
+        z = np.asarray(spla.spsolve(sp.csc_array(sp.eye_array(n * m) - chosen), wider))
         if not np.isfinite(z).all() or z.min() < 0:
             return None
         better = (T[1] @ z) > (T[0] @ z) * (1 + 1e-12)
         if (better == choice).all():
             break
         choice = better
-    z = z * (1 + _MARGIN) + _MARGIN * z.max(initial=0.0)
     terms = int(np.diff(T[0].indptr).max(initial=0)) + 8
     slack = 2 * terms * UNIT * (abs(T[1]) @ z + abs(T[0]) @ z + z + load)
     proved = all(bool((z - M @ z - slack >= load).all()) for M in T)

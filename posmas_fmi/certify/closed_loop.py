@@ -10,6 +10,7 @@ import numpy as np
 
 from posmas_fmi.certify import general
 from posmas_fmi.certify.assumptions import assumptions
+from posmas_fmi.certify.band import guaranteed_band
 from posmas_fmi.certify.certificate import Certificate, Condition
 from posmas_fmi.certify.contraction import Rate, continuous_rate
 from posmas_fmi.certify.delay import statement
@@ -17,13 +18,20 @@ from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.certify.positivity import between_samples, gain_sign, metzler, non_positive_gain
 from posmas_fmi.certify.sampled import contracts, rate_of, sampled_factor
+from posmas_fmi.certify.saturation import region_of_attraction
 from posmas_fmi.certify.weights import Weights
+from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
 Choice = Literal["auto", "p", "perron"]
 
 
-def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
+def certify_loop(
+    loop: Loop,
+    weights: Choice = "auto",
+    saturation: float | None = None,
+    disturbance: Array | None = None,
+) -> Certificate:
     """Prove what can be proved about given gains.
 
     Parameters
@@ -32,6 +40,10 @@ def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
     weights : {"auto", "p", "perron"}
         Agents' weights in the norm: p, the Perron vector of L_p, or p and, where p proves no rate,
         the Perron vector.
+    saturation : float, optional
+        Limit of ``|u|``: adds the certified region of attraction (R).
+    disturbance : (m,) array, optional
+        Bound on what is added to each state's derivative: adds the guaranteed band (G).
 
     Returns
     -------
@@ -56,6 +68,11 @@ def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
         observer.contracts,
         controller.contracts,
     )
+    holds = all(c.holds for c in conditions)
+    band = guaranteed_band(loop, disturbance) if holds and disturbance is not None else None
+    region = None
+    if holds and saturation is not None and controller.v is not None:
+        region = region_of_attraction(loop, chosen, controller.v, saturation)
     return Certificate(
         assumptions=assumptions(loop),
         conditions=conditions,
@@ -67,7 +84,9 @@ def certify_loop(loop: Loop, weights: Choice = "auto") -> Certificate:
         rate_perron=best.rate,
         rate_continuous=best.continuous,
         observer_rate_continuous=observer.continuous,
-        covers=statement(loop, all(c.holds for c in conditions)),
+        covers=statement(loop, holds),
+        region_of_attraction=region,
+        band=None if band is None else tuple(tuple(float(z) for z in row) for row in band),
     )
 
 
@@ -97,14 +116,16 @@ class Prover:
         self.positive = all(c.holds for c in self.signs)
         continuous = self._continuous()
         self.continuous = None if continuous is None else continuous.value
+        proved = continuous
         if loop.period is None:
             self.contracts = _continuous_condition(continuous, feedback, self.positive)
             rate = None if continuous is None or continuous.value <= 0 else continuous.value
         else:
-            factor = self._factor()
+            proved = factor = self._factor()
             self.contracts = contracts(factor, feedback, loop.period, self.positive)
             rate = rate_of(factor, loop.period)
         self.rate = rate
+        self.v = None if proved is None else proved.v
 
     @property
     def proved(self) -> bool:

@@ -80,6 +80,11 @@ def controller_gain(
             raise clash(loop, feedback, problem, found, settings)
         if settings.objective == "gain":
             found = alternate(problem, "small", settings.rate, found.v) or found
+        if settings.objective == "band":
+            if settings.disturbance is not None:
+                problem = attrs.evolve(problem, disturbance=np.array(settings.disturbance))
+            narrow = alternate(problem, "band", v=found.v)
+            found = narrow if narrow is not None and narrow.rate > 0 else found
         K = -towards_zero(found.X / feedback.strong, settings.digits)
         tried = attrs.evolve(loop, K=K)
         if Prover(tried, tried.controller(weights), weights).proved:

@@ -56,6 +56,12 @@ def certified(
         period=period,
     )
     free = baseline(loop)
+    disturbance = None if settings.disturbance is None else np.array(settings.disturbance)
+    if disturbance is not None and disturbance.shape != (agent.m,):
+        raise InputError(
+            f"expected {agent.m} bounds, one per state (got {disturbance.size})",
+            "$.design.disturbance",
+        )
     return Design(
         method=settings.method,
         observer=settings.observer,
@@ -64,7 +70,7 @@ def certified(
         K=K,
         E=E,
         network=network,
-        certificate=certify_loop(loop, settings.weights),
+        certificate=certify_loop(loop, settings.weights, settings.saturation, disturbance),
         baseline=Baseline(free is not None and free > 0, free),
         protocol=settings.protocol,
         form=settings.form,

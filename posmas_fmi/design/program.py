@@ -17,7 +17,7 @@ from posmas_fmi.expression import Array
 
 _INSTANTS = 8  # of the period at which signs are asked for; the certificate proves all of it
 _ROUNDS = 30
-Goal = Literal["fast", "small", "tolerant"]
+Goal = Literal["fast", "small", "tolerant", "band"]
 
 
 @attrs.frozen(eq=False)
@@ -39,6 +39,8 @@ class Problem:
         Whether X ≥ 0.
     tightening : float
         Relative distance kept from every active constraint.
+    disturbance : (m,) array or None
+        Bound of what is added to the derivative, for the goal "band".
     """
 
     A_low: Array
@@ -50,6 +52,7 @@ class Problem:
     period: float | None
     signed: bool
     tightening: float = 1e-5
+    disturbance: Array | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -89,10 +92,11 @@ def alternate(
     Parameters
     ----------
     problem : Problem
-    goal : {"fast", "small", "tolerant"}
-        Largest rate; least Σ|X| for the given `rate`; least violation of signs for it.
+    goal : {"fast", "small", "tolerant", "band"}
+        Largest rate; least Σ|X| for the given `rate`; least violation of signs for it; smallest
+        band under the disturbance.
     rate : float, optional
-        Wanted rate [1/s], for the last two.
+        Wanted rate [1/s], for "small" and "tolerant".
     v : (m,) array, optional
         Where to start; for "small" one that admits the rate.
 
@@ -115,7 +119,7 @@ def alternate(
                 break
             value, X, excess = answer
             T = lines.contraction(X)
-            current = perron_vector(T)
+            current = lines.band(T) if goal == "band" else perron_vector(T)
             if value < best_value:
                 best = Solution(X, current, lines.rate(T), excess)
                 best_value = value
@@ -193,6 +197,21 @@ class _Constraints:
             return -radius
         return float(-np.log(max(radius, 1e-300)) / h)
 
+    def band(self, T: Array) -> Array:
+        """Band of the weakest agent under the disturbance, scaled to 1: the v of the goal."""
+        size = np.eye(self.m) - T if self.problem.period is not None else -T
+        z = np.linalg.solve(size, self.load)
+        return np.asarray(z / z.max()) if z.min() > 0 else perron_vector(T)
+
+    @property
+    def load(self) -> Array:
+        """What the disturbance adds, per second or per period."""
+        w = self.problem.disturbance
+        w = np.ones(self.m) if w is None else w
+        w = np.maximum(w, 1e-6 * w.max())
+        h = self.problem.period
+        return np.asarray(w if h is None else flows(self.problem.A_high, h)[1] @ w)
+
     def bound(self, rate: float) -> float:
         """Return what the contraction must reach for a rate."""
         h = self.problem.period
@@ -212,12 +231,14 @@ class _Constraints:
         cost = np.full(n * sides + extra, 1.0 if goal == "small" else 0.0)
         limits = np.concatenate([self.limits, -self.base @ v])
         if extra:
-            cost[-1] = 1.0
+            cost[-1] = -1.0 if goal == "band" else 1.0
             first = -self.soft.astype(float) if goal == "tolerant" else np.zeros(len(signs))
-            second = -v if goal == "fast" else np.zeros(self.m)
+            second = {"fast": -v, "band": self.load}.get(goal, np.zeros(self.m))
             signs = np.hstack([signs, first[:, None]])
             moved = np.hstack([moved, second[:, None]])
-        if goal != "fast":
+        if goal == "band" and self.problem.period is not None:
+            limits[len(self.limits) :] += v
+        if goal in ("small", "tolerant"):
             assert rate is not None
             limits[len(self.limits) :] += self.bound(rate) * v
         free = [(0.0, 0.0 if zero else None) for zero in self.fixed] * sides

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+
+from posmas_fmi.certify import Loop, certify_loop
+from posmas_fmi.certify.falsify import falsify
+from posmas_fmi.design import DesignSettings, design
+from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2, Example
+
+
+def printed(example: Example, which: int, protocol: str, pin: int = 2) -> Loop:
+    found = example.designs[which]  # type: ignore[index]
+    return Loop(
+        example.agent("tanh"),
+        example.network(pin),
+        np.array(found.K),
+        np.array(found.E),
+        phi=example.phi,
+        mu=example.mu,
+        observer="local" if which == 1 else "distributed",
+        protocol=protocol,  # type: ignore[arg-type]
+        period=0.005,
+    )
+
+
+@pytest.mark.parametrize("example", [EXAMPLE_1, EXAMPLE_2])
+def test_nothing_is_found_against_a_certified_design(example: Example) -> None:
+    made = design(example.agent("tanh"), example.network(2), DesignSettings(phi=example.phi), 0.005)
+    assert made.certificate.certified == "yes"
+    loop = Loop(example.agent("tanh"), made.network, made.K, made.E, phi=example.phi, period=0.005)
+    found = falsify(loop, draws=2000, periods=60)
+    assert found.violations == ()
+    assert found.claimed_factor is not None
+    assert found.worst_factor <= found.claimed_factor * (1 + 1e-9)
+
+
+def test_printed_signs_are_falsified() -> None:
+    found = falsify(printed(EXAMPLE_1, 1, "printed"), draws=200, periods=100)
+    assert any("falls to" in text for text in found.violations)
+    assert any("tracking error grows" in text for text in found.violations)
+
+
+def test_printed_gains_of_example_2_lose_positivity() -> None:
+    loop = printed(EXAMPLE_2, 1, "corrected", pin=1)
+    assert not certify_loop(loop).positive
+    found = falsify(loop, draws=200, periods=20)
+    assert found.least_state < -0.1
+
+
+def test_distributed_observer_is_falsified_where_it_is_only_conditional() -> None:
+    """What theory.md says of P with the distributed observer does not hold for xhat."""
+    loop = attrs.evolve(
+        printed(EXAMPLE_1, 2, "corrected"), E=np.array([[1.98, 1.40], [0.0, 2.55]]), mu=15.0
+    )
+    assert certify_loop(loop).certified == "conditional"
+    found = falsify(loop, draws=400, periods=20, max_delay=0)
+    assert found.least_state < -0.01
+    assert all("error grows" not in text for text in found.violations)
+
+
+def test_a_loop_without_period_is_refused() -> None:
+    with pytest.raises(ValueError, match="period"):
+        falsify(attrs.evolve(printed(EXAMPLE_1, 1, "corrected"), period=None))
