@@ -1,4 +1,4 @@
-"""Build hook: compile the FMUs of the shipped scenarios once, when the package is installed."""
+"""Build hook: compile engine and FMUs of the shipped scenarios when the package is installed."""
 
 import shutil
 import sys
@@ -19,13 +19,15 @@ class CustomBuildHook(BuildHookInterface):
         root = Path(self.root)
         sys.path.insert(0, str(root))
         try:
+            from posmas_fmi.cosim import native
             from posmas_fmi.fmu.build import build_shipped
 
-            built = build_shipped(root / "models", root / "posmas_fmi" / "_built")
+            models, folder = root / "models", root / "posmas_fmi" / "_built"
+            built = build_shipped(models, folder) + native.build_shipped(models, folder)
         finally:
             sys.path.remove(str(root))
         keep = {path.name for path in built}
-        for stale in (root / "posmas_fmi" / "_built").glob("*.fmu"):
+        for stale in folder.iterdir():
             if stale.name not in keep:
                 stale.unlink()
         build_data["pure_python"] = False

@@ -6,6 +6,7 @@ import ctypes
 import logging
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 import attrs
@@ -56,7 +57,14 @@ class Choice:
 
     engine: Literal["c", "numpy"]
     reason: str = ""
-    library: Any = None
+    library: Path | None = None
+
+    def to_dict(self) -> dict[str, str]:
+        """Return what a manifest says about it."""
+        facts = {"used": self.engine}
+        if self.library is not None:
+            facts["library"] = self.library.name  # the name holds a hash of its sources
+        return facts | ({"reason": self.reason} if self.reason else {})
 
 
 def choose(agent: Agent, wanted: Wanted = "auto") -> Choice:
@@ -143,6 +151,7 @@ def run(
     if choice.engine == "numpy":
         return simulate(system, plant, _by_row(record, variables), progress)
     assert isinstance(plant, FmuPlant)
+    assert choice.library is not None
     library = native.load(choice.library)
     return Engine(system, plant, library, threads, variables if record else ()).run(
         record, progress

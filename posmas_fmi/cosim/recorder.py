@@ -67,12 +67,15 @@ class Recorder:
         import h5py
 
         self._layout = layout
-        self._rows: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
-        self._written: dict[str, int] = dict.fromkeys(self._rows, 0)
+        self._blocks: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
+        self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
+        self._written = dict(self._taken)
         # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
         self._disk = h5py.File(path, "w", track_order=True)
         self._file = h5netcdf.File(self._disk, "a")
         self._define(network, variables, attributes)
+        # rows go past h5netcdf, which takes milliseconds for each write
+        self._data = {name: self._disk[name] for name in self._blocks}
 
     def _define(
         self, network: Network, variables: tuple[str, ...], attributes: dict[str, Any]
@@ -109,32 +112,39 @@ class Recorder:
 
     def record(self, time: float, values: dict[str, Array]) -> None:
         """Add one row; the arrays are copied. A variable that is left out stays NaN there."""
-        self._rows["time"].append(np.asarray(time))
-        self.add(values)
+        rows = {name: np.asarray(value)[None] for name, value in values.items()}
+        self.record_block(np.array([time]), rows)
+
+    def record_block(self, times: Array, values: dict[str, Array]) -> None:
+        """Add rows: times (r,) and arrays (r, …), which are copied or written at once."""
+        self.add({"time": times, **values})
 
     def add(self, values: dict[str, Array]) -> None:
-        """Add a row of these variables only, after the last row that they have."""
-        for name, value in values.items():
-            self._rows[name].append(np.array(value, dtype=float))
-        if max(len(rows) for rows in self._rows.values()) >= CHUNK:
+        """Add rows (r, …) of these variables only, after the last row that they have."""
+        large = max(len(block) for block in values.values()) >= CHUNK
+        for name, block in values.items():
+            self._blocks[name].append(block if large else np.array(block, dtype=float))
+            self._taken[name] += len(block)
+        if max(self._taken[name] - self._written[name] for name in values) >= CHUNK:
             self.flush()
 
     def flush(self) -> None:
         """Write what is held in memory."""
-        ends = {name: self._written[name] + len(rows) for name, rows in self._rows.items()}
-        if ends["time"] > self._written["time"]:
-            self._file.resize_dimension("time", ends["time"])
-        for name, rows in self._rows.items():
-            if rows:
-                self._file.variables[name][self._written[name] : ends[name]] = np.stack(rows)
-                rows.clear()
-        self._written = ends
+        for name, data in self._data.items():
+            if len(data) < self._taken["time"]:
+                data.resize(self._taken["time"], axis=0)
+            blocks = self._blocks[name]
+            if blocks:
+                rows = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+                data[self._written[name] : self._taken[name]] = rows
+                blocks.clear()
+        self._written = dict(self._taken)
         self._disk.flush()
 
     @property
     def rows(self) -> int:
         """Number of communication points recorded."""
-        return self._written["time"] + len(self._rows["time"])
+        return self._taken["time"]
 
     def finish(self) -> None:
         """Write the rest and mark the result as complete."""

@@ -233,6 +233,8 @@ class _Builder:
             self.problems.append(("$.scenario.tolerance", "expected a number > 0"))
         if self.tables.scenario.seed < 0:
             self.problems.append(("$.scenario.seed", "expected a whole number >= 0"))
+        if self.tables.scenario.threads < 1:
+            self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
 
 
 def make_agent(table: AgentTable) -> Agent:

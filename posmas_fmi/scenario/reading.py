@@ -95,6 +95,7 @@ def _converter() -> cattrs.Converter:
     converter.register_structure_hook(bool, _truth)
     converter.register_structure_hook_func(_is_list, _list_hook(converter))
     converter.register_structure_hook_func(_is_union, _union_hook(converter))
+    converter.register_structure_hook_func(_is_literal, _one_of)
     return converter
 
 
@@ -161,6 +162,16 @@ def _list_hook(converter: cattrs.Converter) -> Any:
         return tuple(made) if origin is tuple else made
 
     return hook
+
+
+def _is_literal(kind: Any) -> bool:
+    return typing.get_origin(kind) is typing.Literal
+
+
+def _one_of(value: Any, kind: Any) -> Any:
+    if not _fits(value, kind):
+        raise ValueError(f"expected {_words(kind)} (got {_show(value)})")
+    return value
 
 
 def _is_union(kind: Any) -> bool:

@@ -15,7 +15,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.cosim.master import Outcome, Progress, System, simulate
+from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.master import Outcome, Progress, System
 from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
@@ -106,14 +107,15 @@ def run(
 
     designed = make_design_of(scenario)
     files = fmu_files(scenario)
+    choice = engine.choose(scenario.agent, scenario.settings.engine)
     _make_folder(folder)
     for name in ("summary.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     _write_json(folder / "design.json", facts)
-    _write_json(folder / "manifest.json", manifest(scenario, files, command))
+    _write_json(folder / "manifest.json", manifest(scenario, files, choice, command))
     began = time.perf_counter()
-    outcome, baseline = _simulate(scenario, designed, files, folder, progress)
+    outcome, baseline = _simulate(scenario, designed, files, choice, folder, progress)
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
@@ -130,6 +132,7 @@ def _simulate(
     scenario: Scenario,
     designed: Design,
     files: list[Path],
+    choice: engine.Choice,
     folder: Path,
     progress: Callable[[str], Progress | None],
 ) -> tuple[Outcome, Outcome | None]:
@@ -140,11 +143,18 @@ def _simulate(
         _recorder(scenario, designed.network, folder / "results.nc", variables) as recorder,
     ):
         system = make_system(scenario, designed)
-        outcome = simulate(system, plant, recorder.record, progress("simulate"))
+        outcome = engine.run(
+            system,
+            plant,
+            recorder.record_block,
+            progress("simulate"),
+            choice,
+            scenario.settings.threads,
+        )
         recorder.flush()
         baseline = None
         if scenario.baseline and outcome.ended in ("complete", "diverged"):
-            baseline = _without_control(scenario, designed, files, recorder, progress)
+            baseline = _without_control(scenario, designed, files, choice, recorder, progress)
         if outcome.ended == "complete":
             recorder.finish()
     return outcome, baseline
@@ -154,21 +164,29 @@ def _without_control(
     scenario: Scenario,
     designed: Design,
     files: list[Path],
+    choice: engine.Choice,
     recorder: Recorder,
     progress: Callable[[str], Progress | None],
 ) -> Outcome:
     uncontrolled = attrs.evolve(designed, K=np.zeros_like(designed.K))
     rows = recorder.rows
 
-    def record(t: float, values: dict[str, Array]) -> None:
+    def record(times: Array, values: dict[str, Array]) -> None:
         nonlocal rows
         if rows and "x" in values:  # no further than the run that it is compared with
-            rows -= 1
-            recorder.add({"x_baseline": values["x"]})
+            block = values["x"][:rows]
+            rows -= len(block)
+            recorder.add({"x_baseline": block})
 
     with make_plant(scenario, files) as plant:
-        return simulate(
-            make_system(scenario, uncontrolled), plant, record, progress("without control")
+        return engine.run(
+            make_system(scenario, uncontrolled),
+            plant,
+            record,
+            progress("without control"),
+            choice,
+            scenario.settings.threads,
+            variables=("x",),
         )
 
 
@@ -213,13 +231,16 @@ def _recorder(
     return Recorder(path, layout, network, variables, attributes)
 
 
-def manifest(scenario: Scenario, files: list[Path], command: str) -> dict[str, Any]:
+def manifest(
+    scenario: Scenario, files: list[Path], choice: engine.Choice, command: str
+) -> dict[str, Any]:
     """Return what makes the run repeatable: versions, seed, hashes, the scenario itself."""
     return {
         "command": command,
         "scenario": scenario.text,
         "scenario_sha256": _hash(scenario.text.encode()),
         "seed": scenario.settings.seed,
+        "engine": choice.to_dict() | {"threads": scenario.settings.threads},
         "period": scenario.clock.h,
         "until": scenario.clock.time(scenario.clock.steps),
         "fmus": {path.name: _hash(path.read_bytes()) for path in dict.fromkeys(files)},

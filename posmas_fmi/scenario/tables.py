@@ -39,6 +39,11 @@ class ScenarioTable:
         Of every random number of the run.
     tolerance : float
         Largest final error of an agent that counts as converged.
+    engine : {"auto", "c", "numpy"}
+        What runs the communication loop; auto: C where it can, else numpy. The results agree to
+        rounding.
+    threads : int
+        Of the engine, if the FMUs allow it. The results do not depend on it.
     """
 
     name: str
@@ -46,6 +51,8 @@ class ScenarioTable:
     period: float
     seed: int = 0
     tolerance: float = 1e-2
+    engine: Literal["auto", "c", "numpy"] = "auto"
+    threads: int = 1
 
 
 @attrs.frozen
