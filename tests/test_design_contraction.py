@@ -193,3 +193,14 @@ def test_designed_gains_are_always_certified(seed: int) -> None:
     radius = np.abs(np.linalg.eigvals(step)).max()
     assert made.certificate.rate is not None
     assert np.exp(-made.certificate.rate * 0.01) >= radius - 1e-9
+
+
+def test_a_failed_certificate_says_what_would_help() -> None:
+    K, E = [[-0.541353, -0.548052]], EXAMPLE_1.designs[1].E
+    made = certify(EXAMPLE_1.agent(), EXAMPLE_1.network(2), K, E, SETTINGS_1, 0.02)
+    assert made.certificate.certified == "no"
+    text = "; ".join(made.notes)
+    assert "a period of 0.004 s is certified" in text
+    assert "phi = 8" in text
+    wrong_pin = certify(EXAMPLE_1.agent(), EXAMPLE_1.network(1), K, E, SETTINGS_1, 0.005)
+    assert any("pinning agent 2" in note for note in wrong_pin.notes)

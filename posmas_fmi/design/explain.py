@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 
 from posmas_fmi.certify import Loop
+from posmas_fmi.certify.closed_loop import Prover
 from posmas_fmi.certify.loop import Feedback
 from posmas_fmi.design.program import Problem, Solution, alternate
 from posmas_fmi.design.settings import DesignSettings
 from posmas_fmi.errors import DesignError
 
 _PINS_TRIED = 200
+_PINS_PROVED = 30  # a proof costs more than a linear program
+_LOWER = (0.9, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1)
 _SHORTER = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 
 
@@ -88,3 +93,38 @@ def _pins(loop: Loop, problem: Problem, wanted: float) -> list[str]:
             if rate is not None:
                 return [f"{words.format(network.names[best[1][-1]])} gives {rate:.3g} 1/s"]
     return []
+
+
+def remedies(loop: Loop) -> tuple[str, ...]:
+    """Say which single change of period, coupling or pin would make given gains provable."""
+    network = loop.network
+    if loop.protocol == "printed":
+        return ('protocol = "corrected" (L + D) is what can be certified',)
+    if network.unreached() or _proved(loop):
+        return ()
+    found = []
+    if loop.period is not None:
+        h = next((f * loop.period for f in _SHORTER if _proved(loop, period=f * loop.period)), None)
+        if h is not None:
+            found.append(f"with these gains a period of {h:.3g} s is certified")
+    phi = next((f * loop.phi for f in _LOWER if _proved(loop, phi=f * loop.phi)), None)
+    if phi is not None:
+        found.append(f"with these gains phi = {phi:.3g} is certified")
+    if len(network.pinned) == 1 and network.N <= _PINS_PROVED:
+        weight = float(network.pinning.max())
+        for i in range(network.N):
+            other = network.with_pinned([i], weight)
+            if i not in network.pinned and not other.unreached() and _proved(loop, network=other):
+                found.append(f"with these gains pinning agent {network.names[i]} is certified")
+                break
+    return tuple(found) or (
+        "no shorter period, lower phi or other single pin makes these gains provable: design new "
+        'ones with method = "contraction"',
+    )
+
+
+def _proved(loop: Loop, **changes: Any) -> bool:
+    changed = attrs.evolve(loop, **changes)
+    weights = changed.weights_perron
+    feedbacks = (changed.controller(weights), changed.estimator(weights))
+    return all(Prover(changed, f, weights).proved for f in feedbacks)

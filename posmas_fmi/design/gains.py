@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.certify import Loop, baseline, certify_loop
+from posmas_fmi.design.explain import remedies
 from posmas_fmi.design.result import Baseline, Design
 from posmas_fmi.design.settings import DesignSettings
 from posmas_fmi.errors import InputError
@@ -16,10 +18,37 @@ from posmas_fmi.network import Network
 def design(
     agent: Agent, network: Network, settings: DesignSettings, period: float | None
 ) -> Design:
-    """Certify ``settings.K`` and ``settings.E``."""
+    """Certify ``settings.K`` and ``settings.E``; say what would help where that fails."""
     assert settings.K is not None, "settings check it"
     assert settings.E is not None, "settings check it"
-    return certified(agent, network, settings.K, settings.E, settings, period)
+    made = certified(agent, network, settings.K, settings.E, settings, period)
+    if made.certificate.certified != "no":
+        return made
+    return attrs.evolve(
+        made, notes=remedies(loop_of(agent, network, made.K, made.E, settings, period))
+    )
+
+
+def loop_of(
+    agent: Agent,
+    network: Network,
+    K: Array,
+    E: Array,
+    settings: DesignSettings,
+    period: float | None,
+) -> Loop:
+    """Return the closed loop with these gains."""
+    return Loop(
+        agent,
+        network,
+        K,
+        E,
+        phi=settings.phi,
+        mu=settings.mu,
+        observer=settings.observer,
+        protocol=settings.protocol,
+        period=period,
+    )
 
 
 def certified(
@@ -44,17 +73,7 @@ def certified(
             )
     if period is not None and not 0.0 < period < np.inf:
         raise InputError(f"expected a period > 0 s (got {period!r})", "$.scenario.period")
-    loop = Loop(
-        agent,
-        network,
-        K,
-        E,
-        phi=settings.phi,
-        mu=settings.mu,
-        observer=settings.observer,
-        protocol=settings.protocol,
-        period=period,
-    )
+    loop = loop_of(agent, network, K, E, settings, period)
     free = baseline(loop)
     disturbance = None if settings.disturbance is None else np.array(settings.disturbance)
     if disturbance is not None and disturbance.shape != (agent.m,):
