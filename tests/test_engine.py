@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
 from pathlib import Path
 
 import attrs
 import numpy as np
 import pytest
 from fmu_examples import Example, example_1, named, wide
+from hypothesis import given
+from hypothesis import strategies as st
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.cosim import engine
-from posmas_fmi.cosim.channel import Channel
+from posmas_fmi.cosim import engine, native
+from posmas_fmi.cosim.channel import Arrivals, Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.cosim.protocol import make_protocol
+from posmas_fmi.errors import BuildError, FmuCallError, InputError
 from posmas_fmi.expression import VectorFunction
+from posmas_fmi.fmu import build
+from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import Network, network_from_arcs
 
 TOLERANCE = 1e-12
@@ -182,3 +190,256 @@ def test_threads_do_not_change_a_bit(name: str, threads: int, cache: Path) -> No
     np.testing.assert_array_equal(outcome.min_state, alone.min_state)
     for key, value in rows_alone.items():
         np.testing.assert_array_equal(rows[key], value)
+
+
+# ---- what goes wrong -----------------------------------------------------------------------------
+
+FRAGILE = """
+#include <math.h>
+#include "model.h"
+
+/* p[0]: from when on the derivatives, p[1]: the outputs are not finite */
+void model_derivatives(double t, const double *p, const double *u, const double *x, double *dx)
+{
+    dx[0] = t > p[0] ? NAN : u[0] - x[0];
+    dx[1] = -x[1];
+}
+
+void model_outputs(double t, const double *p, const double *u, const double *x, double *y)
+{
+    (void)u;
+    y[0] = t > p[1] ? NAN : x[0];
+    y[1] = x[1];
+}
+
+void model_directional(double t, const double *p, const double *u, const double *x,
+                       const double *su, const double *sx, double *sdx, double *sy)
+{
+    (void)t, (void)p, (void)u, (void)x;
+    sdx[0] = su[0] - sx[0];
+    sdx[1] = -sx[1];
+    sy[0] = sx[0];
+    sy[1] = sx[1];
+}
+"""
+
+
+def fragile() -> FmuModel:
+    variables = (
+        Variable("p", "parameter", (2,), (1e9, 1e9)),
+        Variable("u", "input", (1,), (0.0,)),
+        Variable("x", "state", (2,), (1.0, 1.0)),
+        Variable("y", "output", (2,), depends=("x",)),
+    )
+    return FmuModel("fragile", "fails on demand", variables, {"model.c": FRAGILE}, Experiment())
+
+
+def changed(monkeypatch: pytest.MonkeyPatch, fmi: int, old: str, new: str) -> None:
+    """Build FMUs from now on with other C code around the model."""
+
+    def sources(model: FmuModel, version: int) -> dict[str, str]:
+        files = original(model, version)
+        assert old in files[f"fmi{fmi}.c"]
+        return files | {f"fmi{fmi}.c": files[f"fmi{fmi}.c"].replace(old, new)}
+
+    original = build.sources
+    monkeypatch.setattr(build, "sources", sources)
+
+
+@attrs.frozen
+class Fragile(Case):
+    """Agents that follow `FRAGILE`; `values` are the parameters of some of them."""
+
+    values: dict[int, list[float]] = attrs.field(factory=dict)
+
+    def plant(self, cache: Path) -> FmuPlant:
+        fmu = build.fmu(fragile(), self.fmi, cache=cache)
+        values = {k: named({"p": p}, self.fmi) for k, p in self.values.items()}
+        specs = [PlantSpec(fmu, values.get(k, {})) for k in range(self.n)]
+        states = self.ports("x", 2) if self.shows_states else None
+        names = digraph(self.n).names
+        return FmuPlant(names, specs, self.ports("u", 1), self.ports("y", 2), states, self.until)
+
+
+NEVER = 1e9
+FAILURES = {
+    "step": ({2: [0.495, NEVER]}, "3", "DoStep"),
+    "two steps": ({3: [0.495, NEVER], 1: [0.495, NEVER]}, "2", "DoStep"),
+    "output": ({1: [NEVER, 0.495]}, "2", "Get"),
+    "step before output": ({0: [NEVER, 0.495], 3: [0.495, NEVER]}, "4", "DoStep"),
+    "at the start": ({3: [NEVER, -1.0]}, "4", "Get"),
+}
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("name", FAILURES)
+def test_a_failing_fmu_is_the_same_verdict(name: str, fmi: int, cache: Path) -> None:
+    values, agent, call = FAILURES[name]
+    case = Fragile(values=values, fmi=fmi)
+    expected = run(case, cache, "numpy")
+    assert expected[0].ended == "failed"
+    assert expected[0].failed_agent == agent
+    assert f"fragile-fmi{fmi}" in expected[0].reason
+    assert f"fmi{fmi}{call}" in expected[0].reason
+    if name == "at the start":
+        outcome, rows = run(case, cache, "c")
+        assert rows == {}
+        assert outcome.reason == expected[0].reason
+        return
+    assert expected[0].steps in (49, 50)
+    for threads in (1, 3):
+        assert_alike(run(case, cache, "c", threads), expected)
+
+
+LATE = "if (currentCommunicationPoint > 0.295)"
+STEPPED = "    *lastSuccessfulTime = INSTANCE(instance)->state.v[AT_TIME];"
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        ("*terminateSimulation = true;", "asked to end the simulation"),
+        ("*earlyReturn = true;", "returned early"),
+        ("return (fmi3Status)-7;", "-7 (outside the standard)"),
+        ("return fmi3Discard;", "2 (Discard)"),
+    ],
+)
+def test_odd_answers_of_an_fmu(
+    answer: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed(monkeypatch, 3, STEPPED, f"{STEPPED}\n    {LATE}\n        {answer}")
+    expected = run(Fragile(), tmp_path, "numpy")
+    assert expected[0].ended == "failed"
+    assert reason in expected[0].reason
+    assert_alike(run(Fragile(), tmp_path, "c"), expected)
+
+
+def test_an_fmu_that_gives_no_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call = "first.environment = functions->componentEnvironment;"
+    why = (
+        '((fmi2CallbackLogger *)functions->logger)(first.environment, "", fmi2Error, "", "no %s");'
+    )
+    changed(monkeypatch, 2, call, f"{call}\n        {why}\n        return NULL;")
+    with pytest.raises(FmuCallError, match="no instance: no %s"):
+        Fragile(fmi=2).plant(tmp_path)
+
+
+WARNING = 1  # fmi2Warning, fmi3Warning
+
+
+@pytest.mark.parametrize("which", ["numpy", "c"])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_warnings_are_told_with_their_messages(
+    which: engine.Wanted,
+    fmi: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    hot = "currentCommunicationPoint > 0.295 && currentCommunicationPoint < 0.325"
+    component = "instance" if fmi == 3 else "c"
+    step = f"instance_step(INSTANCE({component}), currentCommunicationPoint,"
+    old = (
+        f"    Status status =\n        {step}" if fmi == 3 else f"    return c ? (fmi2Status){step}"
+    )
+    new = (
+        f'    if ({hot}) {{\n        instance_log(INSTANCE({component}), STATUS_WARNING, "hot");\n'
+        f"        {step} communicationStepSize);\n        return {WARNING};\n    }}\n"
+    )
+    changed(monkeypatch, fmi, old, new + old)
+    outcome, _ = run(Fragile(n=1, fmi=fmi), tmp_path, which)
+    assert outcome.ended == "complete"
+    texts = [record.getMessage() for record in caplog.records]
+    assert any("DoStep warns: hot" in text for text in texts)
+
+
+def test_fmus_called_one_by_one_give_the_same(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a compiler there is neither the engine nor the loop over FMUs."""
+    cases = [
+        CASES["nine, FMI 2"],
+        CASES["scaled"],
+        Fragile(values={2: [0.495, NEVER]}),
+        Fragile(values={1: [NEVER, 0.495]}, fmi=2),
+    ]
+    expected = [run(case, cache, "numpy") for case in cases]
+
+    def no_compiler(*_: object) -> Path:
+        raise BuildError("found no C compiler")
+
+    monkeypatch.setattr(native, "library", no_compiler)
+    choice = engine.choose(cases[0].system().agent)
+    assert choice.to_dict() == {"used": "numpy", "reason": "found no C compiler"}
+    with pytest.raises(BuildError):
+        engine.choose(cases[0].system().agent, "c")
+    for case, wanted in zip(cases, expected, strict=True):
+        outcome, rows = run(case, cache, "numpy")
+        assert outcome.reason == wanted[0].reason
+        for name, value in wanted[1].items():
+            np.testing.assert_array_equal(rows[name], value)
+
+
+def test_functions_in_python_run_with_numpy() -> None:
+    agent = attrs.evolve(agent_of(example_1()), g=lambda t, X: np.sin(X))
+    assert "Python functions" in engine.choose(agent).reason
+    with pytest.raises(InputError, match="expressions"):
+        engine.choose(agent, "c")
+
+
+def test_an_interrupt_ends_the_run_and_keeps_the_rows(cache: Path) -> None:
+    case = Case(n=9, h=0.001, until=10_000.0)
+    system, times = case.system(), []
+    with case.plant(cache) as plant:
+        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        choice = engine.choose(system.agent, "c")
+        outcome = engine.run(system, plant, lambda t, _: times.append(t.copy()), choice=choice)
+        timer.join()
+    assert outcome.ended == "cancelled"
+    recorded = np.concatenate(times)
+    assert 0 < len(recorded) == outcome.steps < 10_000_000
+    np.testing.assert_allclose(recorded, np.arange(outcome.steps) * 0.001, rtol=1e-15)
+
+
+def test_halt_from_another_thread(cache: Path) -> None:
+    case = Case(n=4, h=0.001, until=10_000.0)
+    system = case.system()
+    with case.plant(cache) as plant:
+        library = native.load(engine.choose(system.agent, "c").library)
+        one = engine.Engine(system, plant, library, 2, ())
+        timer = threading.Timer(0.1, one.halt)
+        timer.start()
+        assert one.run(None, None).ended == "cancelled"
+        timer.join()
+
+
+def test_progress_counts_to_the_end(cache: Path) -> None:
+    case, seen = Case(), []
+    with case.plant(cache) as plant:
+        engine.run(case.system(), plant, progress=lambda k, n: seen.append((k, n)))
+    assert seen == sorted(seen)
+    assert seen[-1] == (100, 100)
+
+
+def test_a_plant_can_be_used_again_from_python_after_a_run(cache: Path) -> None:
+    case = Case(until=0.5)
+    with case.plant(cache) as plant:
+        engine.run(case.system(), plant, choice=engine.choose(case.system().agent, "c"))
+        x = plant.states()
+        with pytest.raises(FmuCallError, match="beyond the stop time|stop"):
+            plant.step(50, 0.5, 0.01, np.zeros((4, 1)))
+    assert x is not None
+    assert np.isfinite(x).all()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 3), st.integers(0, 4), st.floats(0, 1))
+def test_arrivals_are_those_of_the_mailbox(seed: int, delay: int, jitter: int, loss: float) -> None:
+    channel = Channel.uniform(5, 1.0, delay, jitter, loss)
+    mailbox = Mailbox(channel, np.zeros((5, 1)), np.random.default_rng(seed))
+    arrivals = Arrivals(channel, np.random.default_rng(seed))
+    ages = np.concatenate([arrivals.draw(0, 7), arrivals.draw(7, 20)])
+    held = np.full(5, -1.0)
+    mailbox.held = held[:, None].copy()
+    for k in range(20):
+        received = mailbox.exchange(k, np.full((5, 1), float(k)))
+        held = np.where(ages[k] >= 0, k - ages[k], held)
+        np.testing.assert_array_equal(received[:, 0], held)

@@ -61,7 +61,7 @@ class Choice:
 
     def to_dict(self) -> dict[str, str]:
         """Return what a manifest says about it."""
-        facts = {"used": self.engine}
+        facts: dict[str, str] = {"used": self.engine}
         if self.library is not None:
             facts["library"] = self.library.name  # the name holds a hash of its sources
         return facts | ({"reason": self.reason} if self.reason else {})
