@@ -16,6 +16,7 @@ from posmas_fmi.errors import InputError, NotBuiltError, PosmasError
 if TYPE_CHECKING:
     from posmas_fmi.cosim.master import Progress
     from posmas_fmi.design import Design
+    from posmas_fmi.fmu.linearise import Linearisation
 
 DONE, NEGATIVE, CANCELLED = 0, 1, 130
 
@@ -141,6 +142,25 @@ def _regress(arguments: argparse.Namespace) -> int:
     return DONE if result.passed else NEGATIVE
 
 
+def _linearise(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.linearise import linearise
+
+    made = linearise(
+        arguments.fmu,
+        arguments.inputs,
+        arguments.outputs,
+        arguments.at,
+        values=dict(arguments.set),
+        states=arguments.states or None,
+        step=arguments.step,
+    )
+    if arguments.json:
+        _print_json(made.to_dict())
+    else:
+        _show_linearisation(made)
+    return DONE
+
+
 def _not_built(name: str) -> Callable[[argparse.Namespace], int]:
     def command(arguments: argparse.Namespace) -> int:
         raise NotBuiltError(f"'posmas-fmi {name}' is not in this version yet")
@@ -170,6 +190,36 @@ def _show_design(made: Design, as_json: bool) -> int:
         for note in made.notes:
             print(f"  note: {note}")
     return DONE if made.certificate.certified != "no" else NEGATIVE
+
+
+def _show_linearisation(made: Linearisation) -> None:
+    print(f"interface  {made.interface}")
+    print(f"method     {made.method}")
+    if made.step is not None:
+        print(f"step       {made.step:g} s")
+    print(f"error      {_number(made.error)} at most in an entry, noise {made.noise:.2g}")
+    print(f"at         {made.at:g} s")
+    for label, names, values in (
+        ("state", made.states, made.x0),
+        ("input", made.inputs, made.u0),
+        ("output", made.outputs, made.y0),
+    ):
+        for name, value in zip(names, values, strict=True):
+            print(f"{label:11}{name} = {value:.6g}")
+    print(f"time       {f'discrete, dt = {made.dt:g} s' if made.dt else 'continuous'}")
+    for name in "ABCD":
+        for k, row in enumerate(getattr(made, name)):
+            print(f"{'' if k else name:11}[{', '.join(f'{value:.6g}' for value in row)}]")
+    poles = ", ".join(f"{z.real:.6g}{f'{z.imag:+.6g}j' if z.imag else ''}" for z in made.poles)
+    print(f"poles      {poles or 'none'} ({'stable' if made.stable else 'not stable'})")
+    if made.named and not made.dt:
+        report = made.metzler
+        low = "; ".join(f"A[{i},{j}] = {v:.4g}" for i, j, v in report.negative)
+        low_B = "; ".join(f"B[{i},{j}] = {v:.4g}" for i, j, v in report.negative_B)
+        print(f"Metzler    {'yes' if report.metzler else f'no: {low}'}")
+        print(f"B >= 0     {'yes' if not low_B else f'no: {low_B}'}")
+    for note in made.notes:
+        print(f"note       {note}")
 
 
 def _certified(made: Design) -> str:
@@ -292,10 +342,37 @@ def _parser() -> argparse.ArgumentParser:
 
     paper = add("paper", _not_built("paper"), "the ledger of the paper (not in this version yet)")
     paper.add_argument("--json", action="store_true")
-    for name, text in (
-        ("check", "preflight of any FMU"),
-        ("linearise", "linear model of an FMU at an operating point"),
+
+    linear = add("linearise", _linearise, "linear model of an FMU at an operating point")
+    linear.add_argument("fmu", type=Path, metavar="FMU")
+    for option, dest, required, text in (
+        ("--in", "inputs", True, "inputs"),
+        ("--out", "outputs", True, "outputs: any real variables"),
+        ("--states", "states", False, "states, of an FMU that does not declare any"),
     ):
+        linear.add_argument(
+            option,
+            dest=dest,
+            nargs="+",
+            action="extend",
+            metavar="NAME",
+            required=required,
+            help=text,
+        )
+    linear.add_argument("--at", type=_seconds, default=0.0, metavar="T", help="time [s]")
+    linear.add_argument("--step", type=_positive, metavar="S", help="communication step [s]")
+    linear.add_argument(
+        "--set",
+        type=_assignment,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters, start values and inputs",
+    )
+    linear.add_argument("--json", action="store_true")
+
+    for name, text in (("check", "preflight of any FMU"),):
         later = add(name, _not_built(name), f"{text} (not in this version yet)")
         later.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     return parser
@@ -319,3 +396,24 @@ def _positive(text: str) -> float:
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"expected a number of seconds > 0 (got {text!r})")
     return value
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a finite time in seconds (got {text!r})")
+    return value
+
+
+def _assignment(text: str) -> tuple[str, float]:
+    name, _, number = text.rpartition("=")
+    try:
+        value = float(number)
+    except ValueError:
+        value = float("nan")
+    if not name or not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected NAME=NUMBER (got {text!r})")
+    return name, value

@@ -1,0 +1,299 @@
+"""Model Exchange instances of an FMU: its right-hand side, its events, and an integrator for it."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import ArrayLike
+
+from posmas_fmi.expression import Array
+from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+
+_MOST_ITERATIONS = 100  # of the discrete states at one event
+_MOST_EVENTS = 10_000  # on the way to one point in time
+_EVENT_WIDTH = 1e-12  # relative: how closely a state event is located
+
+
+class ModelExchangeFile(FmuFile):
+    """An FMU unpacked and loaded once, for any number of Model Exchange instances.
+
+    Parameters, attributes and errors are those of `posmas_fmi.fmu.instance.FmuFile`.
+    """
+
+    kind = "Model Exchange"
+
+    def _interface(self, description: Any) -> Any:
+        return description.modelExchange
+
+    def _binding(self) -> Any:
+        from fmpy.fmi2 import FMU2Model
+        from fmpy.fmi3 import FMU3Model
+
+        return FMU2Model if self.version == 2 else FMU3Model
+
+    def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
+        text, token = name.encode(), self.token.encode()
+        quiet = (False, False)  # neither visible nor debug logging
+        if self.version == 2:
+            arguments: tuple[Any, ...] = (text, 0, token, self._resources)
+            arguments += (ctypes.byref(callbacks), *quiet)
+            function = "fmi2Instantiate"
+        else:
+            arguments = (text, token, self._resources, *quiet)
+            arguments += (self._messages.environment(key), callbacks)
+            function = "fmi3InstantiateModelExchange"
+        component: int | None = self._functions[function](*arguments)
+        return component
+
+    def _made(self, name: str, key: int) -> ModelExchangeInstance:
+        return ModelExchangeInstance(self, name, key)
+
+    def instantiate(self, name: str) -> ModelExchangeInstance:
+        """Create an instance; see `FmuFile.instantiate`."""
+        made = super().instantiate(name)
+        assert isinstance(made, ModelExchangeInstance)
+        return made
+
+
+@attrs.frozen
+class EventInfo:
+    """What an FMU says at an event.
+
+    Attributes
+    ----------
+    again : bool
+        Whether the discrete states need another update.
+    terminate : bool
+    nominals_changed, states_changed : bool
+    next_event : float
+        Time of the next time event [s]; inf if none is known.
+    """
+
+    again: bool
+    terminate: bool
+    nominals_changed: bool
+    states_changed: bool
+    next_event: float
+
+
+class ModelExchangeInstance(FmuInstance):
+    """One Model Exchange instance; made by `ModelExchangeFile.instantiate`.
+
+    The order of calls: `initialise`, `start`, then `evaluate` wherever the right-hand side is
+    wanted, or `advance` along the trajectory.
+
+    Attributes
+    ----------
+    n_states, n_indicators : int
+        Numbers of continuous states and event indicators.
+    next_event : float
+        Time of the next time event [s]; inf if none is known.
+
+    Raises
+    ------
+    FmuCallError
+        As `posmas_fmi.fmu.instance.FmuInstance`.
+    """
+
+    def __init__(self, file: FmuFile, name: str, key: int) -> None:
+        super().__init__(file, name, key)
+        self.n_states = int(file.description.numberOfContinuousStates)
+        self.n_indicators = int(file.description.numberOfEventIndicators)
+        self.next_event = math.inf
+        interface = file.description.modelExchange
+        self._completes = not interface.completedIntegratorStepNotNeeded
+        if file.version == 3:
+            self._completes = bool(interface.needsCompletedIntegratorStep)
+
+    # ---- modes ----------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """After `initialise`: settle the discrete states and enter Continuous-Time Mode."""
+        self._settle()
+
+    def handle_event(self) -> None:
+        """Go through Event Mode and back to Continuous-Time Mode."""
+        self._call("EnterEventMode")
+        self._settle()
+
+    def _settle(self) -> None:
+        for _ in range(_MOST_ITERATIONS):
+            info = self.update_discrete_states()
+            if info.terminate:
+                raise self.error(self._update, "asked to end the simulation")
+            if not info.again:
+                self.next_event = info.next_event
+                self._call("EnterContinuousTimeMode")
+                return
+        raise self.error(
+            self._update, f"the discrete states did not settle in {_MOST_ITERATIONS} updates"
+        )
+
+    @property
+    def _update(self) -> str:
+        return "NewDiscreteStates" if self.file.version == 2 else "UpdateDiscreteStates"
+
+    def update_discrete_states(self) -> EventInfo:
+        """In Event Mode: update the discrete states once."""
+        by = ctypes.byref
+        if self.file.version == 2:
+            from fmpy.fmi2 import fmi2EventInfo
+
+            info = fmi2EventInfo()
+            self._call(self._update, by(info))
+            return EventInfo(
+                bool(info.newDiscreteStatesNeeded),
+                bool(info.terminateSimulation),
+                bool(info.nominalsOfContinuousStatesChanged),
+                bool(info.valuesOfContinuousStatesChanged),
+                float(info.nextEventTime) if info.nextEventTimeDefined else math.inf,
+            )
+        flags = [ctypes.c_bool() for _ in range(5)]
+        time = ctypes.c_double()
+        self._call(self._update, *map(by, flags), by(time))
+        again, terminate, nominals, states, defined = (flag.value for flag in flags)
+        return EventInfo(again, terminate, nominals, states, time.value if defined else math.inf)
+
+    # ---- values ---------------------------------------------------------------------------------
+
+    def set_time(self, time: float) -> None:
+        """Set the independent variable [s]."""
+        self._call("SetTime", time)
+        self.time = time
+
+    def set_states(self, x: ArrayLike) -> None:
+        """Set the continuous states, (n_states,)."""
+        values = np.array(x, dtype=float).reshape(-1)
+        if values.size != self.n_states:
+            raise self.error(
+                "SetContinuousStates", f"expected {self.n_states} states (got {values.size})"
+            )
+        if values.size:
+            self._call("SetContinuousStates", _pointer(values), values.size)
+
+    def states(self) -> Array:
+        """Return the continuous states, (n_states,)."""
+        return self._vector("GetContinuousStates", self.n_states)
+
+    def derivatives(self) -> Array:
+        """Return the derivatives of the continuous states, (n_states,)."""
+        version = self.file.version
+        name = "GetDerivatives" if version == 2 else "GetContinuousStateDerivatives"
+        return self._vector(name, self.n_states)
+
+    def nominals(self) -> Array:
+        """Return the typical sizes of the continuous states, (n_states,)."""
+        return self._vector("GetNominalsOfContinuousStates", self.n_states)
+
+    def event_indicators(self) -> Array:
+        """Return the event indicators, (n_indicators,); a sign change is a state event."""
+        return self._vector("GetEventIndicators", self.n_indicators)
+
+    def _vector(self, function: str, size: int) -> Array:
+        values = np.full(size, np.nan)
+        if size:
+            self._call(function, _pointer(values), size)
+        if not np.isfinite(values).all():
+            k = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise self.error(function, f"value {k + 1} is not finite ({values[k]:g})")
+        return values
+
+    # ---- the way through time -------------------------------------------------------------------
+
+    def advance(self, until: float, rtol: float = 1e-9) -> None:
+        """Integrate to a later time with the inputs as they are; events are handled on the way.
+
+        Parameters
+        ----------
+        until : float
+            [s]
+        rtol : float
+            Relative tolerance; the absolute one is this times the nominal values.
+
+        Raises
+        ------
+        FmuCallError
+            Also if the integration fails, or events crowd.
+        """
+        for _ in range(_MOST_EVENTS):
+            if self.time >= until:
+                return
+            due = self.next_event <= self.time * (1 + _EVENT_WIDTH)
+            if due or self._integrate(min(until, self.next_event), rtol):
+                self.handle_event()
+        raise self.error(self._update, f"more than {_MOST_EVENTS} events before {until:g} s")
+
+    def _integrate(self, until: float, rtol: float) -> bool:
+        """Integrate up to a time or to the first event before it; return whether there is one."""
+        from scipy.integrate import LSODA
+
+        if not self.n_states:
+            self.set_time(until)
+            return self._completed()
+
+        def f(t: float, x: Array) -> Array:
+            self.set_time(t)
+            self.set_states(x)
+            return self.derivatives()
+
+        atol = rtol * self.nominals()
+        solver = LSODA(f, self.time, self.states(), until, rtol=rtol, atol=atol)
+        before = self.event_indicators()
+        while solver.status == "running":
+            reason = solver.step()
+            if solver.status == "failed":
+                raise self.error("GetDerivatives", f"the integration failed: {reason}")
+            dense = solver.dense_output()
+            self._go_to(solver.t, dense(solver.t))
+            after = self.event_indicators()
+            if _changed(before, after):
+                self._locate(dense, before, solver.t_old, solver.t)
+                return True
+            before = after
+            if self._completed():
+                return True
+        return False
+
+    def _go_to(self, t: float, x: Array) -> None:
+        self.set_time(t)
+        self.set_states(x)
+
+    def _locate(self, dense: Any, before: Array, low: float, high: float) -> None:
+        """Bisect to just behind the first sign change."""
+        while high - low > _EVENT_WIDTH * max(abs(high), 1.0):
+            middle = (low + high) / 2
+            self._go_to(middle, dense(middle))
+            if _changed(before, self.event_indicators()):
+                high = middle
+            else:
+                low = middle
+        self._go_to(high, dense(high))
+
+    def _completed(self) -> bool:
+        """Tell the FMU that a step is done; return whether it wants an event."""
+        if not self._completes:
+            return False
+        kind = ctypes.c_int if self.file.version == 2 else ctypes.c_bool
+        event, terminate = kind(), kind()
+        by = ctypes.byref
+        self._call("CompletedIntegratorStep", True, by(event), by(terminate))
+        if terminate.value:
+            raise self.error("CompletedIntegratorStep", "asked to end the simulation")
+        return bool(event.value)
+
+    def do_step(self, time: float, step: float) -> None:
+        """Not there in Model Exchange; see `advance`."""
+        raise self.error("DoStep", "a Model Exchange instance takes no steps; use advance")
+
+
+def _changed(before: Iterable[float], after: Iterable[float]) -> bool:
+    return any((a > 0) != (b > 0) for a, b in zip(before, after, strict=True))
+
+
+def _pointer(values: Array) -> Any:
+    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
