@@ -3,6 +3,7 @@ import subprocess
 import sys
 
 import pytest
+from fmu_examples import tank_fmu
 
 from posmas_fmi import resources
 from posmas_fmi.cli import main
@@ -111,6 +112,9 @@ def test_bad_input_is_one_line_and_exit_code_2(capsys, arguments):
         ["dance"],
         ["run"],
         ["run", "paper_example_1", "--until", "-3"],
+        ["linearise", "some.fmu", "--in", "u"],
+        ["linearise", "some.fmu", "--in", "u", "--out", "y", "--at", "nan"],
+        ["linearise", "some.fmu", "--in", "u", "--out", "y", "--set", "A=many"],
         ["design", "x", "--method", "y"],
     ],
 )
@@ -119,6 +123,50 @@ def test_bad_arguments_are_exit_code_2(capsys, arguments):
         main(arguments)
     assert caught.value.code == 2
     assert "usage:" in capsys.readouterr().err
+
+
+def test_linearise_prints_the_linear_model(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    command = ["linearise", str(path), "--in", "power", "--out", "net", "--out", "flow"]
+    assert main([*command, "--at", "20", "--set", "loss=4", "power=50", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["A"] == [[pytest.approx(-0.08)]]
+    assert printed["B"] == [[pytest.approx(0.02)]]
+    assert printed["D"] == [[pytest.approx(1.0)], [pytest.approx(0.0)]]
+    assert printed["method"] == "directional derivatives"
+    assert printed["metzler"]["metzler"] is True
+    assert printed["poles"] == [[pytest.approx(-0.08), 0.0]]
+    assert main(command) == 0
+    shown = capsys.readouterr().out
+    for line in ("temperature = 300", "continuous", "-0.04 (stable)", "Metzler    yes"):
+        assert line in shown
+
+
+def test_linearise_tells_bad_names_from_bad_fmus(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    assert main(["linearise", str(path), "--in", "powr", "--out", "net"]) == 2
+    assert "did you mean 'power'?" in capsys.readouterr().err
+    broken = tmp_path / "broken.fmu"
+    broken.write_bytes(path.read_bytes()[:100])
+    assert main(["linearise", str(broken), "--in", "power", "--out", "net"]) == 3
+    # a power that is no number is refused by the FMU
+    assert (
+        main(
+            [
+                "linearise",
+                str(path),
+                "--in",
+                "power",
+                "--out",
+                "net",
+                "--set",
+                "power=1e308",
+                "loss=-1e308",
+            ]
+        )
+        == 3
+    )
+    assert "tank" in capsys.readouterr().err
 
 
 def test_help_imports_nothing_heavy():

@@ -11,7 +11,7 @@ from typing import Any
 import control
 import numpy as np
 import pytest
-from fmu_examples import TANK_C, TANK_TOML, example_1, named, tank_fmu, wide
+from fmu_examples import TANK_C, TANK_TOML, example_1, named, tank, tank_fmu, wide
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -19,12 +19,14 @@ from test_fmu_instance import changed, described
 
 from posmas_fmi.errors import FmuCallError, FmuError, InputError
 from posmas_fmi.fmu.build import fmu
+from posmas_fmi.fmu.compile import host, shared_library
 from posmas_fmi.fmu.differences import jacobian
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.iosystem import fmu_to_iosystem
 from posmas_fmi.fmu.linearise import Linearisation, linearise, metzler_report
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile
 from posmas_fmi.fmu.plant import read_plant
+from posmas_fmi.fmu.sources import compiled, sources
 from posmas_fmi.fmu.step_response import Sampled, continuous
 
 INTERFACES = ("Model Exchange", "Co-Simulation")
@@ -465,3 +467,57 @@ def test_a_system_that_cannot_be_made_is_refused_at_once(cache: Path, tmp_path: 
     assert pytest.approx(math.exp(-0.04)) == control.linearize(plant, [300.0], [0.0]).A
     with pytest.raises(FmuError, match=r"flow.*(start|set)"):
         fmu_to_iosystem(closed, ["power"], ["net"], states=["flow"])
+
+
+def eventful(cache: Path) -> Path:
+    """The tank with a time event, 1 K more at 5 s, and a state event, twice the loss at 320 K."""
+    model = tank(cache / "eventful")
+    files = sources(model, 2)
+    old = "memset(eventInfo, 0, sizeof *eventInfo);"
+    assert old in files["fmi2.c"]
+    new = """memset(eventInfo, 0, sizeof *eventInfo);
+    State *s = &INSTANCE(c)->state;
+    if (s->v[AT_TIME] >= 5.0 && !s->unused) {
+        s->unused = 1;
+        s->v[AT_X] += 1.0;
+        eventInfo->valuesOfContinuousStatesChanged = fmi2True;
+        eventInfo->newDiscreteStatesNeeded = fmi2True;
+    }
+    if (s->v[AT_X] >= 320.0)
+        s->v[AT_P] = 4.0;
+    s->dx_known = s->y_known = 0;
+    eventInfo->nextEventTimeDefined = !s->unused;
+    eventInfo->nextEventTime = 5.0;
+"""
+    files["fmi2.c"] = files["fmi2.c"].replace(old, new)
+    old = "(void)eventIndicators;\n    return c && ni == 0 ?"
+    assert old in files["fmi2.c"]
+    new = "eventIndicators[0] = INSTANCE(c)->state.v[AT_X] - 320.0;\n    return c && ni == 1 ?"
+    files["fmi2.c"] = files["fmi2.c"].replace(old, new)
+    library = shared_library(files, compiled(files), model.name, host())
+    whole = fmu(model, 2, cache=cache)
+
+    def change(name: str, data: bytes) -> tuple[str, bytes]:
+        if name.startswith("binaries/"):
+            return name, library
+        if name == "modelDescription.xml":
+            data = data.replace(b'numberOfEventIndicators="0"', b'numberOfEventIndicators="1"')
+        return name, data
+
+    return changed(whole, cache / "eventful.fmu", change)
+
+
+def test_events_are_handled_on_the_way_to_the_operating_point(cache: Path) -> None:
+    path = eventful(cache)
+    at_5 = 340 - 40 * math.exp(-0.2)  # before the time event
+    crossing = 5 + 25 * math.log((340 - at_5 - 1) / 20)
+    expected = {
+        4.0: (340 - 40 * math.exp(-4 / 25), -0.04),
+        6.0: (340 - (340 - at_5 - 1) * math.exp(-1 / 25), -0.04),
+        30.0: (315 + 5 * math.exp(-0.08 * (30 - crossing)), -0.08),
+    }
+    for at, (temperature, slope) in expected.items():
+        made = linearise(path, ["power"], ["flow"], at)
+        assert made.interface == "Model Exchange"
+        assert made.x0 == pytest.approx([temperature], rel=1e-8)
+        np.testing.assert_allclose(made.A, [[slope]], atol=1e-6)
