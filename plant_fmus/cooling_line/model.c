@@ -61,9 +61,10 @@ static double x_coth_x_slope(double x)
  * 1/kappa = (1/a + 1/b)/2 + (q/2) coth(q/2)/UA with q = UA (1/a - 1/b). */
 static double exchanger(double UA, double a, double b, double *by_a, double *by_b)
 {
-    if (a <= 0 || b <= 0) { /* one stream stands still */
-        *by_a = a <= 0 && b > 0 ? 1 : 0;
-        *by_b = b <= 0 && a > 0 ? 1 : 0;
+    const double none = 1e-12; /* [W/K] */
+    if (a <= none || b <= none) { /* a stream stands still */
+        *by_a = b > none ? 1 : 0;
+        *by_b = a > none ? 1 : 0;
         return 0;
     }
     double half_q = UA * (1 / a - 1 / b) / 2, slope = x_coth_x_slope(half_q);

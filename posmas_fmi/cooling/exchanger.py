@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike
 
 from posmas_fmi.expression import Array
 
-_SERIES = 1e-3  # below this x coth x is its series, x tanh x would lose digits
+_SERIES = 1e-3  # below this x coth x is its series: the closed form loses digits
+_STANDSTILL = 1e-12  # W/K: a smaller flow is none
 
 
 def conductance(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
@@ -39,7 +40,7 @@ def conductance(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
     5714.286
     """
     UA, hot, cold = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (UA, hot, cold)))
-    flows = (hot > 0) & (cold > 0)
+    flows = (hot > _STANDSTILL) & (cold > _STANDSTILL)
     a, b = np.where(flows, hot, 1.0), np.where(flows, cold, 1.0)
     q = UA * (1 / a - 1 / b)
     return np.where(flows, 1 / ((1 / a + 1 / b) / 2 + _x_coth_x(q / 2) / UA), 0.0)
@@ -62,7 +63,7 @@ def conductance_slope(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
 def _x_coth_x(x: Array) -> Array:
     small = np.abs(x) < _SERIES
     safe = np.where(small, 1.0, x)
-    return np.where(small, 1 + x**2 / 3, safe / np.tanh(safe))
+    return np.where(small, 1 + np.where(small, x, 0.0) ** 2 / 3, safe / np.tanh(safe))
 
 
 def _x_coth_x_slope(x: Array) -> Array:
