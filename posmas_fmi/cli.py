@@ -93,11 +93,24 @@ def _design(arguments: argparse.Namespace) -> int:
 def _certify(arguments: argparse.Namespace) -> int:
     from posmas_fmi.design import certify
     from posmas_fmi.scenario import load
+    from posmas_fmi.scenario.run import pinned_network
 
     scenario = load(arguments.scenario)
     K, E = _read_gains(arguments.gains)
-    made = certify(scenario.agent, scenario.network, K, E, scenario.design, scenario.clock.h)
+    network, _ = pinned_network(scenario)
+    made = certify(scenario.agent, network, K, E, scenario.design, scenario.clock.h)
     return _show_design(made, arguments.json)
+
+
+def _paper(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.design.ledger import ledger, to_text
+
+    entries = ledger()
+    if arguments.json:
+        _print_json({"entries": [entry.to_dict() for entry in entries]})
+    else:
+        print(to_text(entries))
+    return DONE
 
 
 def _report(arguments: argparse.Namespace) -> int:
@@ -340,7 +353,7 @@ def _parser() -> argparse.ArgumentParser:
     regress.add_argument("reference", type=Path, metavar="REFERENCE.csv")
     regress.add_argument("--json", action="store_true")
 
-    paper = add("paper", _not_built("paper"), "the ledger of the paper (not in this version yet)")
+    paper = add("paper", _paper, "the ledger: printed, computed, verdict, proof")
     paper.add_argument("--json", action="store_true")
 
     linear = add("linearise", _linearise, "linear model of an FMU at an operating point")

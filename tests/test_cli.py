@@ -67,6 +67,34 @@ def test_certify_refuses_what_are_no_gains(tmp_path, capsys, content):
     assert capsys.readouterr().err.startswith("posmas-fmi: ")
 
 
+def test_paper_prints_the_ledger(capsys):
+    assert main(["paper", "--json"]) == 0
+    entries = json.loads(capsys.readouterr().out)["entries"]
+    assert {"reproduced", "rounded", "contradicted", "infeasible"} == {
+        entry["verdict"] for entry in entries
+    }
+    assert main(["paper"]) == 0
+    counts = [sum(e["verdict"] == v for e in entries) for v in ("reproduced", "contradicted")]
+    assert f"{counts[0]} reproduced" in capsys.readouterr().out
+
+
+def test_pins_are_placed_where_the_scenario_leaves_them_open(tmp_path, capsys):
+    text = (resources.shipped("models") / "paper_example_1.toml").read_text(encoding="utf-8")
+    path = tmp_path / "auto.toml"
+    path.write_text(text.replace("pinned = [2]", "pinned = {count = 2}"), encoding="utf-8")
+    assert main(["design", str(path), "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["pinned"] == ["2", "4"]
+    assert "best of all choices" in made["notes"][0]
+    gains = tmp_path / "gains.json"
+    gains.write_text(json.dumps({"K": made["K"], "E": made["E"]}))
+    assert main(["certify", str(path), "--gains", str(gains), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rate"] == made["rate"]
+    path.write_text(text.replace("pinned = [2]", 'pinned = "auto"'), encoding="utf-8")
+    assert main(["design", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["pinned"] == ["2"]
+
+
 def test_report_is_made_again_from_what_is_stored(tmp_path, capsys):
     main([*SHORT, "--out", str(tmp_path)])
     first = (tmp_path / "report.html").read_bytes()

@@ -64,12 +64,26 @@ def make_design_of(scenario: Scenario) -> Design:
     PosmasError
         As `posmas_fmi.design.design`.
     """
-    network = scenario.network
-    if scenario.pins:
-        from posmas_fmi.design.pinning import place_pins
+    network, notes = pinned_network(scenario)
+    made = design(scenario.agent, network, scenario.design, scenario.clock.h)
+    return attrs.evolve(made, notes=(*notes, *made.notes))
 
-        network = place_pins(network, scenario.pins)
-    return design(scenario.agent, network, scenario.design, scenario.clock.h)
+
+def pinned_network(scenario: Scenario) -> tuple[Network, tuple[str, ...]]:
+    """Return the network with its pins, placed where the scenario leaves them open, and notes.
+
+    Raises
+    ------
+    NetworkError
+        If so few pins cannot reach every agent.
+    """
+    if not scenario.pins:
+        return scenario.network, ()
+    from posmas_fmi.design.pinning import place
+
+    placement = place(scenario.network, scenario.pins)
+    network = scenario.network.with_pinned(placement.pinned)
+    return network, (placement.note(network.names),)
 
 
 def run(
