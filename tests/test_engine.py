@@ -425,7 +425,7 @@ def test_a_plant_can_be_used_again_from_python_after_a_run(cache: Path) -> None:
     with case.plant(cache) as plant:
         engine.run(case.system(), plant, choice=engine.choose(case.system().agent, "c"))
         x = plant.states()
-        with pytest.raises(FmuCallError, match="beyond the stop time|stop"):
+        with pytest.raises(FmuCallError, match="stop"):
             plant.step(50, 0.5, 0.01, np.zeros((4, 1)))
     assert x is not None
     assert np.isfinite(x).all()

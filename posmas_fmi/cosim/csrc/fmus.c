@@ -29,12 +29,10 @@ static int fail(Report *report, Incident incident)
     return 0;
 }
 
-/* Whether the status lets the run go on. */
-static int check(int status, Incident incident, Report *report)
+/* A status other than OK: note it; whether the run goes on. */
+static int odd(int status, Call call, int64_t agent, int64_t before, Report *report)
 {
-    if (status == OK)
-        return 1;
-    incident.status = status;
+    Incident incident = {.call = call, .agent = agent, .status = status, .said = before};
     if (status != WARNING)
         return fail(report, incident);
     if (!report->warnings++)
@@ -58,49 +56,51 @@ static int set(const Binding *b, void *component, const Ports *p, const double *
     return ((Set3 *)b->set)(component, p->references, n, values, (size_t)p->n_values);
 }
 
-static int write(const Fmus *f, const Binding *b, int64_t agent, const double *values,
-                 double *scratch, Report *report)
+/* The values of an exchange from the inputs; false: those beside them could not be read. */
+static int convert(const Fmus *f, const Binding *b, int64_t agent, const double *inputs,
+                   double *values, Report *report)
 {
     const Ports *p = &b->inputs;
-    void *component = f->component[agent];
-    Incident incident = {CALL_SET, agent, 0, 0, 0, said(f)};
-    if (p->places || p->scale) {
-        if (p->partial) {
-            incident.call = CALL_GET_BEFORE_SET;
-            if (!check(get(b, component, p, scratch), incident, report))
-                return 0;
-            incident.call = CALL_SET;
-            incident.said = said(f);
-        }
-        for (int64_t k = 0; k < p->n_ports; k++)
-            scratch[p->places ? p->places[k] : k] =
-                p->scale ? values[k] * p->scale[k] + p->offset[k] : values[k];
-        values = scratch;
+    if (p->partial) {
+        const int64_t before = said(f);
+        const int status = get(b, f->component[agent], p, values);
+        if (status != OK && !odd(status, CALL_GET_BEFORE_SET, agent, before, report))
+            return 0;
     }
-    return check(set(b, component, p, values), incident, report);
+    for (int64_t k = 0; k < p->n_ports; k++)
+        values[p->places ? p->places[k] : k] =
+            p->scale ? inputs[k] * p->scale[k] + p->offset[k] : inputs[k];
+    return 1;
 }
 
-int fmus_step(const Fmus *f, int64_t agent, double t, double h, const double *values,
+int fmus_step(const Fmus *f, int64_t agent, double t, double h, const double *inputs,
               double *scratch, Report *report)
 {
     const Binding *b = &f->bindings[f->binding[agent]];
     void *component = f->component[agent];
-    if (!write(f, b, agent, values, scratch, report))
+    if (b->inputs.places || b->inputs.scale) {
+        if (!convert(f, b, agent, inputs, scratch, report))
+            return 0;
+        inputs = scratch;
+    }
+    int64_t before = said(f);
+    int status = set(b, component, &b->inputs, inputs);
+    if (status != OK && !odd(status, CALL_SET, agent, before, report))
         return 0;
-    Incident incident = {CALL_STEP, agent, 0, 0, 0, said(f)};
-    if (b->fmi == 2)
-        return check(((Step2 *)b->do_step)(component, t, h, 0), incident, report);
+    before = said(f);
+    if (b->fmi == 2) {
+        status = ((Step2 *)b->do_step)(component, t, h, 0);
+        return status == OK || odd(status, CALL_STEP, agent, before, report);
+    }
     bool event = false, terminate = false, early = false;
     double reached = t;
-    int status =
-        ((Step3 *)b->do_step)(component, t, h, false, &event, &terminate, &early, &reached);
-    if (!check(status, incident, report))
+    status = ((Step3 *)b->do_step)(component, t, h, false, &event, &terminate, &early, &reached);
+    if (status != OK && !odd(status, CALL_STEP, agent, before, report))
         return 0;
     if (!terminate && !early)
         return 1;
-    incident.call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
-    incident.value = reached;
-    return fail(report, incident);
+    const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
+    return fail(report, (Incident){.call = call, .agent = agent, .value = reached});
 }
 
 int fmus_read(const Fmus *f, int64_t agent, double *values, double *scratch, Report *report)
@@ -108,18 +108,17 @@ int fmus_read(const Fmus *f, int64_t agent, double *values, double *scratch, Rep
     const Binding *b = &f->bindings[f->binding[agent]];
     const Ports *p = &b->readings;
     const int direct = !p->places && !p->scale;
-    double *to = direct ? values : scratch;
-    Incident incident = {CALL_GET, agent, 0, 0, 0, said(f)};
-    if (!check(get(b, f->component[agent], p, to), incident, report))
+    const int64_t before = said(f);
+    const int status = get(b, f->component[agent], p, direct ? values : scratch);
+    if (status != OK && !odd(status, CALL_GET, agent, before, report))
         return 0;
     for (int64_t k = 0; k < p->n_ports; k++) {
-        double value = direct ? values[k] : scratch[p->places ? p->places[k] : k];
-        if (!isfinite(value)) {
-            incident.call = CALL_NOT_FINITE;
-            incident.port = k;
-            incident.value = value;
-            return fail(report, incident);
-        }
+        const double value = direct ? values[k] : scratch[p->places ? p->places[k] : k];
+        if (!isfinite(value))
+            return fail(report, (Incident){.call = CALL_NOT_FINITE,
+                                           .agent = agent,
+                                           .port = k,
+                                           .value = value});
         if (!direct)
             values[k] = p->scale ? (value - p->offset[k]) / p->scale[k] : value;
     }

@@ -66,8 +66,9 @@ typedef struct {
     int64_t warnings;
 } Report;
 
-/* Both return whether all went well; `values` has the ports, `scratch` room for an exchange. */
-int fmus_step(const Fmus *fmus, int64_t agent, double t, double h, const double *values,
+/* Both return whether all went well; inputs and values are those of the ports, `scratch` has room
+ * for an exchange. */
+int fmus_step(const Fmus *fmus, int64_t agent, double t, double h, const double *inputs,
               double *scratch, Report *report);
 int fmus_read(const Fmus *fmus, int64_t agent, double *values, double *scratch, Report *report);
 
