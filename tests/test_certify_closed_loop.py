@@ -204,7 +204,7 @@ def test_weighted_norm_falls_in_every_period_whatever_the_nonlinearities(observe
         factor = sampled_factor(flow, feedback, loop.period)
         assert factor is not None
         v = weights.nu[:, None] * factor.v[None, :]
-        for _ in range(200):
+        for _ in range(40):
             Phi, Gamma = random_period(rng, loop)
             z = rng.choice([-1.0, 1.0, rng.uniform(-1, 1)], size=v.shape) * v
             if feedback.name == "controller":

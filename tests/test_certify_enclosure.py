@@ -24,7 +24,7 @@ def reference_exp(P: np.ndarray, tau: float) -> mpmath.matrix:
 @settings(deadline=None, max_examples=15)
 @given(hnp.arrays(float, (3, 3), elements=entries), st.floats(1e-6, 2.0))
 def test_exponential_of_a_nonnegative_matrix_is_enclosed_tightly(P: np.ndarray, tau: float) -> None:
-    E, _ = exp_nonnegative(point(P), np.array([tau]))
+    E, _, _ = exp_nonnegative(point(P), np.array([tau]))
     exact = reference_exp(P, tau)
     for i in range(3):
         for j in range(3):
@@ -36,17 +36,23 @@ def test_exponential_of_a_nonnegative_matrix_is_enclosed_tightly(P: np.ndarray, 
 
 def test_mean_of_the_exponential_solves_its_equation() -> None:
     P, tau = np.array([[1.0, 2.0], [0.5, 3.0]]), 0.3
-    _, mean = exp_nonnegative(point(P), np.array([tau]))
+    _, mean, second = exp_nonnegative(point(P), np.array([tau]))
     # P (1/τ)∫e^{Ps}ds = (e^{Pτ} - I)/τ
     left = matmul(point(P[None]), mean)
     right = (reference_exp(P, tau) - mpmath.eye(2)) / tau
     for i in range(2):
         for j in range(2):
             assert left.low[0, i, j] <= right[i, j] <= left.high[0, i, j]
+    # P² φ₂ = (e^{Pτ} - I - Pτ)/τ²
+    left = matmul(point((P @ P)[None]), second)
+    right = (reference_exp(P, tau) - mpmath.eye(2) - mpmath.matrix(P.tolist()) * tau) / tau**2
+    for i in range(2):
+        for j in range(2):
+            assert left.low[0, i, j] <= right[i, j] <= left.high[0, i, j]
 
 
 def test_too_large_an_exponent_gives_up_honestly() -> None:
-    E, mean = exp_nonnegative(point([[1e300]]), np.array([1.0]))
+    E, mean, _ = exp_nonnegative(point([[1e300]]), np.array([1.0]))
     assert E.low[0, 0, 0] == 0.0
     assert np.isinf(mean.high[0, 0, 0])
 

@@ -41,7 +41,7 @@ def test_no_disturbance_leaves_the_band() -> None:
     assert band is not None
     L_p = LOOP.network.pinned_laplacian.toarray()
     z = band * rng.uniform(-1, 1, band.shape)
-    for _ in range(2000):
+    for _ in range(300):
         Phi, Gamma, M = periods(rng, LOOP)
         u = M * LOOP.phi * (L_p @ z @ LOOP.K.T)
         push = u @ LOOP.agent.B.T + w * np.sign(z)

@@ -166,7 +166,7 @@ def test_huge_entries_do_not_crash() -> None:
     json.dumps(made.to_dict(), allow_nan=False)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=12)
 @given(st.integers(0, 10**6))
 def test_designed_gains_are_always_certified(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -204,3 +204,18 @@ def test_a_failed_certificate_says_what_would_help() -> None:
     assert "phi = 8" in text
     wrong_pin = certify(EXAMPLE_1.agent(), EXAMPLE_1.network(1), K, E, SETTINGS_1, 0.005)
     assert any("pinning agent 2" in note for note in wrong_pin.notes)
+
+
+@pytest.mark.parametrize("period", [None, 5.0])
+def test_states_that_no_input_reaches_directly(period: float | None) -> None:
+    """A line with one input and zeros in A: the gain is used where it helps, and proved."""
+    A = [[-0.1996, 0.0998, 0.0998], [0.0435, -0.0945, 0.0509], [0.0, 0.0243, -0.0727]]
+    line = linear_agent(A, [[0.0], [0.0], [0.01]], np.eye(3), sector=(0.8, 1.2))
+    network = network_from_arcs(3, [(1, 2), (2, 3), (3, 1)], [1])
+    made = design(line, network, DesignSettings(), period)
+    assert made.certificate.certified == "yes"
+    assert made.K[0, 0] == 0.0  # A_31 = 0 leaves no room there
+    assert made.K[0, 2] < 0
+    assert made.certificate.rate is not None
+    assert made.baseline.rate is not None
+    assert made.certificate.rate > made.baseline.rate * 1.01

@@ -82,24 +82,24 @@ def shifted(M: Interval, sigma: float) -> Interval:
     return total.keep_sign(diagonal, np.zeros_like(diagonal))
 
 
-def exp_nonnegative(P: Interval, times: Array) -> tuple[Interval, Interval]:
-    """``e^{Pτ}`` and its mean ``(1/τ) ∫₀^τ e^{Ps} ds`` for P ≥ 0 and several τ ≥ 0.
+def exp_nonnegative(P: Interval, times: Array) -> tuple[Interval, Interval, Interval]:
+    """``φ₀ = e^{Pτ}``, ``φ₁ = (1/τ) ∫₀^τ e^{Ps} ds`` and ``φ₂ = Σ (Pτ)^k/(k+2)!`` for P ≥ 0.
 
     Parameters
     ----------
     P : (m, m) Interval
         Entries whose lower ends are ≥ 0.
     times : (n,) array
-        Exact doubles.
+        Exact doubles ≥ 0.
 
     Returns
     -------
-    exponential, mean : (n, m, m) Interval
+    phi0, phi1, phi2 : (n, m, m) Interval
         Where ``‖P‖τ`` is beyond 600 only ``[0, inf]``.
 
     Examples
     --------
-    >>> E, mean = exp_nonnegative(point([[1.0]]), np.array([1.0]))
+    >>> E, _, _ = exp_nonnegative(point([[1.0]]), np.array([1.0]))
     >>> bool(E.low[0, 0, 0] <= np.e <= E.high[0, 0, 0]), bool(E.high[0, 0, 0] < 2.7182818284592)
     (True, True)
     """
@@ -108,17 +108,18 @@ def exp_nonnegative(P: Interval, times: Array) -> tuple[Interval, Interval]:
     if not norm <= _MAX_EXPONENT:
         shape = (len(times), m, m)
         unknown = Interval(np.zeros(shape), np.full(shape, np.inf))
-        return unknown, unknown
+        return unknown, unknown, unknown
     squarings = max(0, math.ceil(math.log2(max(norm, 1e-300))) + 1)
     scaled = np.ldexp(times, -squarings)[:, None, None]
     X = P * point(scaled)
     identity = point(np.eye(m)[None])
-    exponential, mean = _taylor(X, identity)
+    phi = list(_taylor(X, identity))
     for _ in range(squarings):
-        mean = product((exponential + identity) * point(0.5), mean)
-        exponential = product(exponential, exponential)
+        half = product((phi[0] + identity) * point(0.5), phi[1])
+        phi[2] = (product(phi[1], phi[1]) + phi[2] + phi[2]) * point(0.25)
+        phi[0], phi[1] = product(phi[0], phi[0]), half
     reached = _reached(P)
-    return _masked(exponential, reached), _masked(mean, reached)
+    return _masked(phi[0], reached), _masked(phi[1], reached), _masked(phi[2], reached)
 
 
 def _masked(a: Interval, reached: Mask) -> Interval:
@@ -134,15 +135,18 @@ def _reached(P: Interval) -> Mask:
     return pattern
 
 
-def _taylor(X: Interval, identity: Interval) -> tuple[Interval, Interval]:
-    """Series of e^X and (e^X - I)/X by Horner's rule for ‖X‖ ≤ 1/2, remainders added above."""
-    exponential = mean = identity
+def _taylor(X: Interval, identity: Interval) -> tuple[Interval, Interval, Interval]:
+    """Series of φ₀, φ₁ and φ₂ by Horner's rule for ‖X‖ ≤ 1/2, remainders added above."""
+    zeroth = first = identity
+    second = identity
     for k in range(_DEGREE, 0, -1):
-        mean = identity + _over(product(X, mean), k + 1)
-        exponential = identity + _over(product(X, exponential), k)
+        second = identity + _over(product(X, second), k + 2)
+        first = identity + _over(product(X, first), k + 1)
+        zeroth = identity + _over(product(X, zeroth), k)
     # the first term left out is at most 2^-17/17!, the following ones shrink by 1/36
     remainder = 1.1 * 2.0**-17 / math.factorial(17)
-    return _raise(exponential, remainder), _raise(mean, remainder)
+    second = second * point(0.5)
+    return _raise(zeroth, remainder), _raise(first, remainder), _raise(second, remainder)
 
 
 def product(a: Interval, b: Interval) -> Interval:

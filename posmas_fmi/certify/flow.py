@@ -21,6 +21,31 @@ from posmas_fmi.interval import Interval
 
 
 @attrs.frozen(eq=False)
+class Orders:
+    """Bounds times ``e^{στ}``, all (n, m, m); every entry increases with τ.
+
+    Attributes
+    ----------
+    zeroth : Interval
+        ``e^{A_low τ}``.
+    first : Interval
+        ``(e^{A_low τ} - e^{-στ} I)/τ``.
+    second : Interval
+        The same without its value at τ = 0, divided by τ once more.
+    held : Interval
+        ``Γ_τ(A_high)/τ``.
+    held_second : Interval
+        The same without its value I at τ = 0, divided by τ once more.
+    """
+
+    zeroth: Interval
+    first: Interval
+    second: Interval
+    held: Interval
+    held_second: Interval
+
+
+@attrs.frozen(eq=False)
 class Flow:
     """Transition matrices between ``A_low = A - |H|ℓ`` (Metzler) and ``A_high = A + |H|ℓ``.
 
@@ -43,31 +68,35 @@ class Flow:
         """Shift that makes both matrices non-negative."""
         return shift_of(self.A_low, self.A_high)
 
-    def shifted_bounds(self, times: Array) -> tuple[Interval, Interval, Interval]:
-        """``e^{στ}`` times ``e^{A_low τ}``, ``(e^{A_low τ}-e^{-στ}I)/τ`` and ``Γ_τ(A_high)/τ``.
-
-        Each (n, m, m); every entry increases with τ.
-        """
+    def shifted_bounds(self, times: Array) -> Orders:
+        """Bounds over several times; see `Orders`."""
         P = shifted(self.A_low, self.sigma)
-        exponential, mean = exp_nonnegative(P, times)
-        held = self._held(shifted(self.A_high, self.sigma), times, len(P.low))
-        return exponential, _matmul_mean(P, mean), held
+        zeroth, first, second = exp_nonnegative(P, times)
+        W = _augmented(shifted(self.A_high, self.sigma), self.sigma)
+        _, held_first, held_second = exp_nonnegative(W, times)
+        return Orders(
+            zeroth,
+            _power(P, 1, first),
+            _power(P, 2, second),
+            _upper_right(_power(W, 1, held_first)),
+            _upper_right(_power(W, 2, held_second)),
+        )
 
-    def _held(self, P: Interval, times: Array, m: int) -> Interval:
+    def _held(self, P: Interval, times: Array) -> Interval:
         """``(1/τ) ∫₀^τ e^{P(τ-s)} e^{σs} ds``, by the exponential of ``[[P, I], [0, σI]]``."""
         W = _augmented(P, self.sigma)
-        _, mean = exp_nonnegative(W, times)
-        return block(_matmul_mean(W, mean), slice(0, m), slice(m, None))
+        _, mean, _ = exp_nonnegative(W, times)
+        return _upper_right(_power(W, 1, mean))
 
     def over(self, h: float) -> tuple[Interval, Interval, Interval, Interval]:
         """``e^{A_low h}``, ``e^{A_high h}``, ``Γ(A_low)``, ``Γ(A_high)``, each (m, m)."""
-        times, m = np.array([h]), len(self.A_low.low)
+        times = np.array([h])
         factor = exp_scalar(-(point(self.sigma) * point(h)))
         parts = []
         for A in (self.A_low, self.A_high):
             P = shifted(A, self.sigma)
-            exponential, _ = exp_nonnegative(P, times)
-            held = self._held(P, times, m) * point(h)
+            exponential, _, _ = exp_nonnegative(P, times)
+            held = self._held(P, times) * point(h)
             parts.append((_first(exponential * factor), _first(held * factor)))
         return parts[0][0], parts[1][0], parts[0][1], parts[1][1]
 
@@ -82,5 +111,14 @@ def _augmented(P: Interval, sigma: float) -> Interval:
     return Interval(low, high)
 
 
-def _matmul_mean(P: Interval, mean: Interval) -> Interval:
-    return product(Interval(P.low[None], P.high[None]), mean)
+def _power(P: Interval, k: int, phi: Interval) -> Interval:
+    """``P^k φ`` for k ≥ 1."""
+    batch = Interval(P.low[None], P.high[None])
+    for _ in range(k):
+        phi = product(batch, phi)
+    return phi
+
+
+def _upper_right(W: Interval) -> Interval:
+    m = W.low.shape[-1] // 2
+    return block(W, slice(0, m), slice(m, None))

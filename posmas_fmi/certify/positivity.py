@@ -84,8 +84,9 @@ def metzler(loop: Loop, feedback: Feedback) -> Condition:
 def between_samples(flow: Flow, feedback: Feedback, h: float) -> Condition:
     """``e^{A_low τ} - strong·Γ_τ(A_high) N ≥ 0`` for every τ in [0, h].
 
-    Both terms, times ``e^{στ}`` and divided by τ off the diagonal, increase with τ. On a piece
-    [a, b] the first is taken at a and the second at b; pieces are halved until all are proved.
+    Both terms, times ``e^{στ}`` and divided by τ off the diagonal (by τ² where both vanish to first
+    order), increase with τ. On a piece [a, b] the first is taken at a and the second at b; pieces
+    are halved until all are proved.
     """
     name = f"T: {feedback.name} keeps signs for every tau <= h"
     if not flow.metzler or not (feedback.N.low >= 0).all():
@@ -132,14 +133,20 @@ class _Ends:
     def __init__(self, flow: Flow, N: Interval, times: Array) -> None:
         self.flow, self.N = flow, N
         self.off = ~np.eye(len(N.low), dtype=bool)
+        # entries that vanish to first order on both sides are compared to second order
+        A = flow.A_low
+        self.flat = self.off & (A.low == 0) & (A.high == 0) & (N.low == 0) & (N.high == 0)
         self.times = times
         self.own, self.spent = self._terms(times)
 
     def _terms(self, times: Array) -> tuple[Array, Array]:
         """Lower bound of what is there and upper bound of what feedback takes, (n, m, m)."""
-        exponential, increment, held = self.flow.shifted_bounds(times)
-        taken = product(held, Interval(self.N.low[None], self.N.high[None])).high
-        own = np.where(self.off, increment.low, exponential.low)
+        bounds = self.flow.shifted_bounds(times)
+        N = Interval(self.N.low[None], self.N.high[None])
+        first, second = product(bounds.held, N).high, product(bounds.held_second, N).high
+        taken = np.where(self.flat, second, first)
+        own = np.where(self.off, bounds.first.low, bounds.zeroth.low)
+        own = np.where(self.flat, bounds.second.low, own)
         with np.errstate(invalid="ignore"):
             whole = np.nextafter(taken * times[:, None, None], np.inf)
         # nothing is taken from entries that are exactly zero, and e^{A_low τ} ≥ 0

@@ -88,7 +88,7 @@ def controller_gain(
         K = -towards_zero(found.X / feedback.strong, settings.digits)
         tried = attrs.evolve(loop, K=K)
         if Prover(tried, tried.controller(weights), weights).proved:
-            return K, found.rate
+            return K + 0.0, found.rate
     raise _unproved("K")
 
 
@@ -153,11 +153,11 @@ def _reach(problem: Problem, wanted: float) -> Solution | None:
 def _by_continuation(problem: Problem, wanted: float) -> Solution | None:
     """Least gain in continuous time: v follows the rate from what is easy to what is wanted."""
     size = float(np.abs(problem.A_high).max())
-    bounded = attrs.evolve(problem, period=min(1e-3 / max(size, wanted, 1e-300), 1e3))
+    bounded = attrs.evolve(problem, period=min(0.2 / max(size, 1e-300), 1e3))
     fastest = alternate(bounded, "fast")
     if fastest is None:
         return None
-    for rate in (wanted, 0.5 * fastest.rate):
+    for rate in (min(wanted, 0.9 * fastest.rate), 0.5 * fastest.rate):
         found = alternate(problem, "small", rate, fastest.v)
         if found is not None and found.rate > 0:
             return found

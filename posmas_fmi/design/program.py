@@ -17,6 +17,7 @@ from posmas_fmi.expression import Array
 
 _INSTANTS = 8  # of the period at which signs are asked for; the certificate proves all of it
 _ROUNDS = 30
+_FASTEST = 20.0  # continuous feedback of a state on itself, in units of the fastest diagonal of A
 Goal = Literal["fast", "small", "tolerant", "band"]
 
 
@@ -118,6 +119,9 @@ def alternate(
             if answer is None:
                 break
             value, X, excess = answer
+            if goal == "fast":
+                X = lines.fill(X, current)
+                value = -lines.rate(lines.contraction(X))
             T = lines.contraction(X)
             current = lines.band(T) if goal == "band" else perron_vector(T)
             if value < best_value:
@@ -166,6 +170,10 @@ class _Constraints:
                 taken = self.entries(held) / scale[..., None]
                 rows.append(taken.reshape(-1, self.count))
                 limits.append((low / scale * keep).ravel())
+        else:
+            # in continuous time nothing else limits feedback of a state on itself
+            rows.append(N[~off])
+            limits.append(np.full(self.m, _FASTEST * np.abs(np.diag(problem.A_high)).max()))
         soft = np.ones(sum(len(r) for r in rows), dtype=bool)
         if not problem.signed:
             size = problem.tightening * 0.1 * np.abs(problem.A_low).max()
@@ -217,6 +225,28 @@ class _Constraints:
         h = self.problem.period
         wanted = rate * (1 + self.problem.tightening)
         return -wanted if h is None else float(np.exp(-wanted * h))
+
+    def fill(self, X: Array, v: Array) -> Array:
+        """Raise a gain X ≥ 0 to the limit of the signs, in the direction that helps the rate most.
+
+        The first program cares for the worst row only; rows that no input reaches leave the gain
+        undetermined there. The left Perron vector w says what lowers the eigenvalue of the whole.
+        """
+        from scipy.optimize import linprog
+
+        if not self.problem.signed:
+            return X
+        w = perron_vector(self.contraction(X).T)
+        gain = np.einsum("i,ijc,j->c", w, self.entries(self.pull), v)
+        if not gain.max(initial=0.0) > 0:
+            return X
+        free = [
+            (low, 0.0 if zero else None) for low, zero in zip(X.ravel(), self.fixed, strict=True)
+        ]
+        answer = linprog(
+            -gain / gain.max(), A_ub=self.rows, b_ub=self.limits, bounds=free, method="highs"
+        )
+        return X if answer.status != 0 else np.asarray(answer.x).reshape(X.shape)
 
     def solve(self, v: Array, goal: Goal, rate: float | None) -> tuple[float, Array, float] | None:
         """One linear program; its value, X and the violation of signs."""

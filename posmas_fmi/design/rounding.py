@@ -40,4 +40,4 @@ def _rounded(M: Array, digits: int, relative_zero: float, integer: Callable[[flo
             places = digits - 1 - math.floor(math.log10(abs(value)))
             # the decimal string makes the double the one that a reader would type
             out[index] = float(f"{integer(value * 10.0**places)}e{-places}")
-    return out
+    return out + 0.0  # no negative zeros
