@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal
 
 import attrs
@@ -15,6 +14,7 @@ import sympy
 from posmas_fmi.errors import AgentError
 from posmas_fmi.expression import Array, VectorFunction, symbol
 from posmas_fmi.interval import Range, bounds
+from posmas_fmi.sector import sector_range
 
 if TYPE_CHECKING:
     import control
@@ -222,7 +222,7 @@ class Agent:
         if not isinstance(self.sec, VectorFunction):
             return None
         return tuple(
-            _sector_of(
+            sector_range(
                 e,
                 f"u{k + 1}",
                 self.region.get(f"u{k + 1}", (-math.inf, math.inf)),
@@ -472,49 +472,3 @@ def _check_functions(agent: Agent) -> None:
                     f"(got {', '.join(sorted(others))} as well)",
                     f"$.agent.sec[{k}]",
                 )
-
-
-def _sector_of(
-    expr: sympy.Expr, name: str, region: tuple[float, float], claim: tuple[float, float]
-) -> Range:
-    """Enclose ``sec(u)/u``: directly where it simplifies, else piecewise with the slope at zero."""
-    u = symbol(name)
-    ratio = sympy.expand(expr / u)
-    direct = bounds(ratio, {name: region}, claim)
-    if math.isfinite(direct.low) and math.isfinite(direct.high):
-        return direct
-    if sympy.simplify(expr.subs(u, 0)) != 0:
-        return direct
-    low, high = region
-    size = max(abs(low), abs(high))
-    size = size if 0 < size < math.inf else 1.0  # inputs come in W as well as in units of 1
-    near, far = size * 2.0**-6, size * 2.0**10
-    pieces = [bounds(sympy.diff(expr, u), {name: (max(low, -near), min(high, near))}, claim)]
-    edges = [-math.inf, -far, -near, near, far, math.inf]
-    for a, b in pairwise(edges):
-        a, b = max(a, low), min(b, high)
-        if a < b and (a >= near or b <= -near):
-            pieces.append(bounds(_divide(expr, u, positive=a > 0), {name: (a, b)}, claim))
-    # the slope encloses the ratio near zero but is not attained by it: witnesses come from ratios
-    witnesses = pieces[1:] or pieces
-    least = min(witnesses, key=lambda r: r.least)
-    most = max(witnesses, key=lambda r: r.most)
-    return Range(
-        min(r.low for r in pieces),
-        max(r.high for r in pieces),
-        least.least,
-        most.most,
-        least.argmin,
-        most.argmax,
-    )
-
-
-def _divide(expr: sympy.Expr, u: sympy.Symbol, positive: bool) -> sympy.Expr:
-    """``expr / u`` for u of one sign, divided inside sums, Min and Max so that u cancels there."""
-    if expr.is_Add:
-        return sympy.Add(*(_divide(arg, u, positive) for arg in expr.args))
-    if expr.func in (sympy.Min, sympy.Max):
-        turned = {sympy.Min: sympy.Max, sympy.Max: sympy.Min}
-        function = expr.func if positive else turned[expr.func]
-        return function(*(_divide(arg, u, positive) for arg in expr.args))
-    return sympy.expand(expr / u)
