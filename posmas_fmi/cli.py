@@ -81,7 +81,7 @@ def _design(arguments: argparse.Namespace) -> int:
     import attrs
 
     from posmas_fmi.scenario import load
-    from posmas_fmi.scenario.run import make_design_of
+    from posmas_fmi.scenario.job import make_design_of
 
     scenario = load(arguments.scenario)
     if arguments.method:
@@ -93,7 +93,7 @@ def _design(arguments: argparse.Namespace) -> int:
 def _certify(arguments: argparse.Namespace) -> int:
     from posmas_fmi.design import certify
     from posmas_fmi.scenario import load
-    from posmas_fmi.scenario.run import pinned_network
+    from posmas_fmi.scenario.job import pinned_network
 
     scenario = load(arguments.scenario)
     K, E = _read_gains(arguments.gains)
