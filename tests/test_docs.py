@@ -59,6 +59,16 @@ def _help(name, capsys):
     return capsys.readouterr().out
 
 
+def test_the_page_of_the_paper_has_every_entry_of_the_ledger():
+    """Regenerate with the command that the page names."""
+    from posmas_fmi.design.ledger import ledger
+
+    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    for entry in ledger():
+        erratum = f"(erratum {entry.erratum}) " if entry.erratum else ""
+        assert f"[{entry.verdict}] {erratum}{entry.item}" in page
+
+
 def test_links_of_the_documentation_lead_somewhere():
     for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
