@@ -114,7 +114,7 @@ def test_nonlinear_part_is_of_fourth_order():
 
 @pytest.mark.parametrize("example", [1, 2])
 def test_one_step_of_the_observer_is_within_1e_6_of_the_flow(example):
-    """What docs/certificates.md says: the certificate takes this step as exact."""
+    """What docs/theory.md says: the certificate takes this step as exact."""
     agent, h, rng = paper.agent(example), 0.005, np.random.default_rng(0)
     step, worst = Propagator.of(agent, h), 0.0
     for _ in range(100):
