@@ -325,6 +325,35 @@ def test_a_sampled_system_has_its_continuous_one_back(
     np.testing.assert_allclose(found[1], B, atol=1e-7)
 
 
+def test_responses_of_no_linear_system_are_told(cache: Path, tmp_path: Path) -> None:
+    """A limit that the pulse itself runs into: 41 samples of something else."""
+    old = "dx[0] = (u[0] - p[0] * (x[0] - 290.0)) / 50.0"
+    new = "dx[0] = x[0] > 300.0 + 1e-4 ? -sqrt(x[0] - 300.0) : u[0] - 100.0"
+    path = tank_with(cache, "bent", old, new, 2)
+    closed = without_derivatives(path, tmp_path / "closed.fmu")
+    made = linearise(closed, ["power"], ["flow"], step=0.05)
+    assert any("not those of a linear system" in note for note in made.notes)
+
+
+def test_states_that_do_not_start_where_they_are_told(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the initial state solves equations: there the derivatives are not used."""
+    from posmas_fmi.fmu.evaluation import Restart
+
+    def stubborn(self: Restart, instance: FmuInstance, x: np.ndarray, u: np.ndarray) -> None:
+        if abs(x[0] - 300.0) > 1e-9:
+            raise FmuError("the state 'temperature' does not start where it is told")
+
+    monkeypatch.setattr(Restart, "set", stubborn)
+    path = tank_fmu(cache, 2)
+    made = linearise(path, ["power"], ["flow"], interface="Co-Simulation")
+    assert (made.method, made.error) == ("directional derivatives", None)
+    assert "does not start where it is told" in made.notes[0]
+    assert "nothing to compare" in made.notes[1]
+    np.testing.assert_allclose(made.A, [[-0.04]])
+
+
 @pytest.mark.parametrize("pole", [0.0, -0.5])
 def test_a_truly_discrete_system_has_none(pole: float) -> None:
     one = np.ones((1, 1))

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _AGREE = 1e-4  # relative: directional derivatives and differences say the same
+_MISFIT = 1e-3  # relative: a response that a linear model misses
 
 DIRECTIONAL = "directional derivatives"
 DIFFERENCES = "central differences"
@@ -333,7 +334,9 @@ class _Ladder:
             if made is not None:
                 return made
         if f is not None:
-            return self.by_differences(f)
+            made = self.attempt(DIFFERENCES, lambda: self.by_differences(f))
+            if made is not None:
+                return made
         return self.by_steps()
 
     def attempt(self, what: str, way: Callable[[], Linearisation]) -> Linearisation | None:
@@ -349,7 +352,11 @@ class _Ladder:
         for way in equations(self.file, self.names, self.values, self.instance):
             try:
                 f = way()
-                f(self.point.time, self.point.x, self.point.u)
+                m, z = len(self.point.x), np.concatenate([self.point.x, self.point.u])
+                # setting what is there already proves little; it comes last, so that a Model
+                # Exchange instance is left at the operating point
+                for at in (z + self.steps(), z):
+                    f(self.point.time, at[:m], at[m:])
             except FmuError as error:
                 note = f"derivatives read in Initialization Mode: {error.message}"
                 if note not in self.notes:
@@ -379,6 +386,8 @@ class _Ladder:
             error = self.disagreement(f, J)
             if error > _AGREE * max(1.0, float(np.abs(J).max(initial=0.0))):
                 raise FmuError(f"they are off by {error:.3g} from differences along one direction")
+        else:
+            self.notes.append("there was nothing to compare the directional derivatives with")
         rate = None if f is None else f(point.time, point.x, point.u)[0]
         return self.result(J, rate, DIRECTIONAL, np.zeros(0), error, 0.0)
 
@@ -510,6 +519,11 @@ class _Ladder:
         if found is None:
             notes.append("no continuous system has these samples: this is the sampled model itself")
         order = len(A)
+        if made.misfit > _MISFIT:
+            notes.append(
+                f"the responses are not those of a linear system of order {order}: off by "
+                f"{made.misfit:.2g} of the largest, or as much between large and small pulses"
+            )
         if not made.named:
             notes.append(
                 "the FMU shows no states: these are coordinates of what the inputs reach and the "

@@ -22,6 +22,8 @@ _SAMPLES = 41  # of a pulse response
 _FEWEST = 9
 _GROWTH = 1e3
 _LARGEST_ORDER = 20
+_NOTHING = 1e-150
+_FIT = 1e-7  # relative: a response is explained
 _RANK = 1e-7  # relative: smaller singular values of the Hankel matrix are noise
 _REAL = 1e-6  # relative: what is left by rounding, of a logarithm or a direct term
 
@@ -45,6 +47,9 @@ class Sampled:
         Perturbations.
     named : bool
         Whether x are the states of `Signals`.
+    misfit : float
+        Of the responses that it was realised from, or between those to large and to small
+        pulses, relative to the largest sample.
     """
 
     Ad: Array
@@ -57,6 +62,7 @@ class Sampled:
     how: str
     steps: Array
     named: bool
+    misfit: float = 0.0
 
 
 def continuous(sampled: Sampled) -> tuple[Array, Array] | None:
@@ -85,6 +91,7 @@ def continuous(sampled: Sampled) -> tuple[Array, Array] | None:
         return None
     block = np.eye(m + p)
     block[:m, :m], block[:m, m:] = sampled.Ad, sampled.Bd
+    block[np.abs(block) < _NOTHING] = 0.0  # the logarithm divides by what is there
     M = np.asarray(logm(block)) / sampled.step
     if np.abs(M.imag).max() > _REAL * max(1.0, float(np.abs(M).max())):
         return None
@@ -162,9 +169,10 @@ def from_pulses(
     FmuError
         If the FMU has no inputs to give a pulse to, or the states are not all reached.
     """
-    if not names.inputs:
+    if not names.inputs or not (names.states or names.outputs):
         raise FmuError(
-            "expected states that can be set, or inputs (the FMU shows neither)", file.path.name
+            "expected states that can be set, or inputs and outputs (the FMU shows neither)",
+            file.path.name,
         )
     runs = _Runs(file, names, values, instance, point, step)
     pulses = steps_for(point.u, np.array([file.variable(n).nominal for n in names.inputs]))
@@ -173,9 +181,9 @@ def from_pulses(
     markov = made.value.reshape(shape).transpose(1, 2, 0)
     kept = _bounded(markov)
     uncertain = made.error.reshape(shape).transpose(1, 2, 0)[:, :, :kept]
-    Ad, Bd, C, D, error = _realise(markov[:, :, :kept], uncertain, names, file.path.name)
+    Ad, Bd, C, D, error, misfit = _realise(markov[:, :, :kept], uncertain, names, file.path.name)
     named = bool(names.states)
-    return Sampled(Ad, Bd, C, D, step, error, made.noise, runs.how, pulses, named)
+    return Sampled(Ad, Bd, C, D, step, error, made.noise, runs.how, pulses, named, misfit)
 
 
 def _bounded(markov: Array) -> int:
@@ -230,27 +238,28 @@ class _Runs:
 
 def _realise(
     markov: Array, uncertain: Array, names: Signals, where: str
-) -> tuple[Array, Array, Array, Array, float]:
-    """Return Ad, Bd, C, D and their error from the samples after each step of a pulse response.
+) -> tuple[Array, Array, Array, Array, float, float]:
+    """Return Ad, Bd, C, D, error and relative misfit from the samples of a pulse response.
 
-    Sample 1 is C Bd + D: a step holds its input to its end. So the later ones, C Ad^k Bd for
-    k ≥ 1, are realised, Bd comes from Ad Bd, and D is what is left of sample 1.
+    The order is the lowest that explains the samples as well as they are known.
     """
     m, p = len(names.states), markov.shape[1]
     scale = np.abs(markov).max(axis=(1, 2), keepdims=True)
     scale[scale == 0] = 1.0  # each signal counts alike
-    Ad, AB, Cs, order = _eigensystem(markov[:, :, 1:] / scale)
-    Cs = Cs * scale[:, 0]
-    Bd = np.linalg.lstsq(Ad, AB, rcond=1e-10)[0] if order else AB
-    D = markov[:, :, 0] - Cs @ Bd
-    first = np.abs(markov[:, :, 0])
-    D[np.abs(D) <= _REAL * np.maximum(first, first.max(initial=0.0))] = 0.0
-    fitted = np.empty_like(markov)
-    column = Bd
-    for k in range(markov.shape[2]):
-        fitted[:, :, k] = Cs @ column + (D if k == 0 else 0)
-        column = Ad @ column
-    error = float(np.maximum(np.abs(fitted - markov), uncertain).max())
+    samples = markov / scale
+    known = float((uncertain / scale).max())
+    enough = max(_FIT, 2 * known)
+    best, misfit, order = _of_order(samples, 0), np.inf, 0
+    for k in range(_highest_order(samples) + 1):
+        system = _of_order(samples, k)
+        off = float(np.abs(_response(*system, samples.shape[2]) - samples).max())
+        if off < misfit:
+            best, misfit, order = system, off, k
+        if misfit <= enough:
+            break
+    Ad, Bd, Cs, D = best[0], best[1], best[2] * scale[:, 0], best[3] * scale[:, 0]
+    D[np.abs(D) <= _REAL * np.abs(markov[:, :, 0]).max(initial=0.0)] = 0.0
+    error = max(misfit * float(scale.max()), float(uncertain.max()))
     if m:
         if order != m or np.linalg.cond(Cs[:m]) > 1e10:
             raise FmuError(
@@ -261,21 +270,45 @@ def _realise(
         T = Cs[:m]
         back = np.linalg.inv(T)
         Ad, Bd, Cs = T @ Ad @ back, T @ Bd, Cs @ back
-    return np.asarray(Ad), np.asarray(Bd), Cs[m:], D[m:].reshape(-1, p), error
+    return np.asarray(Ad), np.asarray(Bd), Cs[m:], D[m:].reshape(-1, p), error, max(misfit, known)
 
 
-def _eigensystem(markov: Array) -> tuple[Array, Array, Array, int]:
-    """Return Ad, Ad Bd, C and the order."""
+def _highest_order(samples: Array) -> int:
+    """Return the rank of the Hankel matrix, as far as it can be realised."""
+    q, p, count = samples.shape
+    half = (count - 1) // 2
+    blocks = [[samples[:, :, 1 + i + j] for j in range(half)] for i in range(half)]
+    s = np.linalg.svd(np.block(blocks), compute_uv=False)
+    rank = int((s > _RANK * s[0]).sum())
+    return int(min(rank, _LARGEST_ORDER, (half - 1) * min(q, p)))
+
+
+def _of_order(samples: Array, order: int) -> tuple[Array, Array, Array, Array]:
+    """Realise pulse responses with a given order; return Ad, Bd, C, D.
+
+    Sample 1 is C Bd + D: a step holds its input to its end. So the later ones, C Ad^k Bd for
+    k ≥ 1, are realised, Bd comes from Ad Bd, and D is what is left of sample 1.
+    """
     import control
 
-    q, p, count = markov.shape
-    half = count // 2
-    blocks = [[markov[:, :, i + j] for j in range(half)] for i in range(half)]
-    s = np.linalg.svd(np.block(blocks), compute_uv=False)
-    order = min(int((s > _RANK * s[0]).sum()), _LARGEST_ORDER)
+    q, p, count = samples.shape
     if order == 0:
-        return np.zeros((0, 0)), np.zeros((0, p)), np.zeros((q, 0)), 0
-    # python-control counts a direct term first, which these samples do not have
-    data = np.concatenate([np.zeros((q, p, 1)), markov], axis=2)
-    system, _ = control.eigensys_realization(data, order, m=half - 1, n=half - 1, dt=True)
-    return np.asarray(system.A), np.asarray(system.B), np.asarray(system.C), order
+        return np.zeros((0, 0)), np.zeros((0, p)), np.zeros((q, 0)), samples[:, :, 0].copy()
+    # python-control counts a direct term first: here it is left out
+    data = samples.copy()
+    data[:, :, 0] = 0.0
+    half = (count - 1) // 2 - 1
+    system, _ = control.eigensys_realization(data, order, m=half, n=half, dt=True)
+    Ad, C = np.asarray(system.A), np.asarray(system.C)
+    Bd = np.linalg.lstsq(Ad, np.asarray(system.B), rcond=1e-10)[0]
+    return Ad, Bd, C, np.asarray(samples[:, :, 0] - C @ Bd)
+
+
+def _response(Ad: Array, Bd: Array, C: Array, D: Array, count: int) -> Array:
+    """Return the samples after each step of a pulse response, (q, p, count)."""
+    columns = [Bd]
+    for _ in range(count - 1):
+        columns.append(Ad @ columns[-1])
+    samples = np.stack([C @ column for column in columns], axis=2)
+    samples[:, :, 0] += D
+    return samples
