@@ -18,6 +18,7 @@ from posmas_fmi.cooling import (
     line_values,
     return_range,
     sector,
+    slope_sector,
     valve_mapping,
 )
 from posmas_fmi.cooling.exchanger import conductance, conductance_slope
@@ -186,6 +187,25 @@ def test_the_sector_is_tight() -> None:
 def test_a_valve_that_does_not_close_narrows_the_sector() -> None:
     # the largest gain is that of half strokes, the smallest that of the open valve
     assert sector(LINE, (15.0, 15.0), (0.6, 0.8))[0] > sector(LINE, (15.0, 15.0))[0]
+
+
+@pytest.mark.parametrize("header", [(1.0, 1.0), (0.3, 2.0)])
+def test_the_slope_sector_encloses_and_is_tight(header: tuple[float, float]) -> None:
+    low, high = slope_sector(LINE, (10.0, 22.0), (0.3, 1.0), header)
+    y, h = np.meshgrid(np.linspace(0.3, 1.0, 701), np.linspace(*header, 201))
+    slope = valve_mapping(LINE).gain * LINE.kappa_slope(y, h)
+    assert low <= 10 * slope.min() <= low * 1.04
+    assert high >= 22 * slope.max() >= high * 0.96
+
+
+@pytest.mark.parametrize(
+    ("opening", "header"), [((0.5, 0.5), (1, 1)), ((-0.1, 1), (1, 1)), ((0, 1), (0, 1))]
+)
+def test_slope_sectors_of_nothing(
+    opening: tuple[float, float], header: tuple[float, float]
+) -> None:
+    with pytest.raises(InputError):
+        slope_sector(LINE, (10.0, 22.0), opening, header)
 
 
 def test_the_valve_mapping() -> None:

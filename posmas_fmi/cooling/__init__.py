@@ -19,6 +19,7 @@ from posmas_fmi.cooling.mapping import (
     line_agent,
     return_range,
     sector,
+    slope_sector,
     valve_mapping,
 )
 from posmas_fmi.cooling.plant import header_values, line_values
@@ -47,6 +48,7 @@ __all__ = [
     "return_range",
     "sector",
     "settling_time",
+    "slope_sector",
     "thermal_cycles",
     "training_loads",
     "valve_mapping",

@@ -43,7 +43,7 @@ def conductance(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
     flows = (hot > _STANDSTILL) & (cold > _STANDSTILL)
     a, b = np.where(flows, hot, 1.0), np.where(flows, cold, 1.0)
     q = UA * (1 / a - 1 / b)
-    return np.where(flows, 1 / ((1 / a + 1 / b) / 2 + _x_coth_x(q / 2) / UA), 0.0)
+    return np.where(flows, 1 / ((1 / a + 1 / b) / 2 + x_coth_x(q / 2) / UA), 0.0)
 
 
 def conductance_slope(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
@@ -57,16 +57,17 @@ def conductance_slope(UA: ArrayLike, hot: ArrayLike, cold: ArrayLike) -> Array:
     UA, hot, cold = (np.asarray(v, dtype=float) for v in (UA, hot, cold))
     kappa = conductance(UA, hot, cold)
     half_q = UA * (1 / hot - 1 / cold) / 2
-    return np.asarray((kappa / cold) ** 2 * (1 - _x_coth_x_slope(half_q)) / 2)
+    return np.asarray((kappa / cold) ** 2 * (1 - x_coth_x_slope(half_q)) / 2)
 
 
-def _x_coth_x(x: Array) -> Array:
+def x_coth_x(x: Array) -> Array:
+    """Return x coth x, 1 at zero."""
     small = np.abs(x) < _SERIES
     safe = np.where(small, 1.0, x)
     return np.where(small, 1 + np.where(small, x, 0.0) ** 2 / 3, safe / np.tanh(safe))
 
 
-def _x_coth_x_slope(x: Array) -> Array:
+def x_coth_x_slope(x: Array) -> Array:
     """Return coth x - x/sinh² x, between -1 and 1."""
     small = np.abs(x) < _SERIES
     safe = np.where(small, 1.0, np.clip(x, -300, 300))  # sinh overflows later than this

@@ -9,6 +9,7 @@ import numpy as np
 import sympy
 
 from posmas_fmi.agent import Agent
+from posmas_fmi.cooling.enclosure import kappa_slope_range
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import VectorFunction, parse, symbol
@@ -155,6 +156,43 @@ def sector(
             pieces.append(bounds(secant, {"y": (a, b)}))
     least, most = min(p.low for p in pieces), max(p.high for p in pieces)
     return valve.gain * theta_r[0] * least, valve.gain * theta_r[1] * most
+
+
+def slope_sector(
+    line: LineParameters,
+    theta_r: tuple[float, float],
+    opening: tuple[float, float],
+    header: tuple[float, float] = (1.0, 1.0),
+) -> tuple[float, float]:
+    """Enclose the slope ``∂sec(u; θr, h)/∂u``: the incremental sector that integral action needs.
+
+    A changed header pressure moves the operating point, which the integral takes care of; the
+    slope is what its certificate (I) asks for. It is smallest where the valve is wide open or
+    nearly closed, so a smaller `opening` narrows it.
+
+    Parameters
+    ----------
+    line : LineParameters
+    theta_r : (float, float)
+        Range of the return temperature [K].
+    opening : (float, float)
+        Range of the valve position.
+    header : (float, float)
+        Range of the header pressure factor.
+
+    Returns
+    -------
+    (float, float)
+
+    Examples
+    --------
+    >>> low, high = slope_sector(LineParameters(), (10.0, 22.0), (0.4, 1.0))
+    >>> low < 1.0 < high
+    True
+    """
+    low, high = kappa_slope_range(line, opening, header)
+    gain = valve_mapping(line).gain
+    return gain * theta_r[0] * low, gain * theta_r[1] * high
 
 
 def line_agent(
