@@ -201,3 +201,20 @@ def test_bad_files_are_one_clear_error(tmp_path, name, content):
 def test_negative_weights_of_a_sparse_matrix_are_refused():
     with pytest.raises(NetworkError):
         Network(sp.csr_array([[0.0, -1.0], [0.0, 0.0]]), [1.0, 0.0])
+
+
+@pytest.mark.parametrize("shape", ["random", "path"])
+def test_large_networks_are_solved_whatever_their_structure(shape: str) -> None:
+    n = 2500
+    rng = np.random.default_rng(0)
+    if shape == "random":
+        hearing = np.repeat(np.arange(n), 5)
+        heard = (hearing + rng.integers(1, n, 5 * n)) % n
+    else:  # the Krylov method fails here, the factorisation is cheap
+        hearing, heard = np.arange(1, n), np.arange(n - 1)
+    adjacency = sp.csr_array((np.ones(len(hearing)), (hearing, heard)), shape=(n, n))
+    pinning = np.zeros(n)
+    pinning[0] = 1.0
+    network = Network(adjacency, pinning)
+    assert network.pinned_laplacian @ network.p == pytest.approx(np.ones(n), abs=1e-6)
+    assert network.p.min() > 0
