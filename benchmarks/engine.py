@@ -2,10 +2,10 @@
 
     python benchmarks/engine.py [--agents 9 100 1000] [--repeat 5]
 
-All in one run, 1 ms steps of the paper's Example 1. The floor is a loop in C over the same FMUs that
-only sets u, steps and gets y, with the inputs of the controlled run. Engine and numpy path do all of
-the master's work besides: observer, protocol, exchange, checks, reading x; the other masters do less:
-they step the FMUs without any controller or connection.
+All in one run, 1 ms steps of the paper's Example 1. The floor is a loop in C over the same FMUs
+that only sets u, steps and gets y, with the inputs of the controlled run. Engine and numpy path do
+all of the master's work besides: observer, protocol, exchange, checks, reading x. The other masters
+do less: they step the FMUs without any controller or connection.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, Literal, NoReturn
 
 import attrs
@@ -245,11 +246,11 @@ class _Run:
             self.largest_initial = float(self.tracking.max())
             scale = max(np.abs(truth).max(), np.abs(state.s).max(), np.abs(state.xhat).max(), 1.0)
             self.limit = DIVERGED * float(scale)
-        lowest = truth.min(axis=1)
+        lowest = reduce(np.minimum, truth.T)
         falls = lowest < self.min_state
         self.min_state = np.where(falls, lowest, self.min_state)
         self.min_time = np.where(falls, t, self.min_time)
-        size = np.maximum(np.abs(truth).max(axis=1), np.abs(state.xhat).max(axis=1))
+        size = np.maximum(_largest(truth), _largest(state.xhat))
         if not (size <= self.limit).all():
             self._diverged(t, size)
 
@@ -261,7 +262,12 @@ class _Run:
 def errors_at(truth: Array, xhat: Array, s: Array) -> tuple[Array, Array]:
     """Largest modulus over the states of tracking and of estimation error, (N,) each."""
     with np.errstate(invalid="ignore", over="ignore"):
-        return np.abs(truth - s).max(axis=1), np.abs(truth - xhat).max(axis=1)
+        return _largest(truth - s), _largest(truth - xhat)
+
+
+def _largest(X: Array) -> Array:
+    """Largest modulus in each row, (N,); column by column, for rows are short and many."""
+    return np.asarray(reduce(np.maximum, np.abs(X).T))
 
 
 def diverged_reason(names: Sequence[str], size: Array, limit: float, t: float) -> tuple[str, str]:

@@ -66,17 +66,21 @@ class Propagator:
 
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""
-        h, H = self.h, self.H
-        ga = self.g(t, X) @ H.T
-        base = X @ self.half.T + W @ self.half_gamma.T
-        a = base + ga @ self.half_gamma.T
-        gb = self.g(t + 0.5 * h, a) @ H.T
-        b = base + gb @ self.half_gamma.T
-        gc = self.g(t + 0.5 * h, b) @ H.T
-        c = a @ self.half.T + (2.0 * gc - ga + W) @ self.half_gamma.T
-        gd = self.g(t + h, c) @ H.T
-        linear = X @ self.full.T + W @ self.gamma.T
-        return np.asarray(linear + ga @ self.start.T + (gb + gc) @ self.middle.T + gd @ self.end.T)
+        # columns are agents here: products of a small matrix and a wide one are the fast ones
+        x, w, h = X.T, W.T, self.h
+        ga = self._weighted(t, x)
+        base = self.half @ x + self.half_gamma @ w
+        a = base + self.half_gamma @ ga
+        gb = self._weighted(t + 0.5 * h, a)
+        gc = self._weighted(t + 0.5 * h, base + self.half_gamma @ gb)
+        c = self.half @ a + self.half_gamma @ (2.0 * gc - ga + w)
+        gd = self._weighted(t + h, c)
+        linear = self.full @ x + self.gamma @ w
+        end = linear + self.start @ ga + self.middle @ (gb + gc) + self.end @ gd
+        return np.ascontiguousarray(end.T)
+
+    def _weighted(self, t: float, x: Array) -> Array:
+        return np.asarray(self.H @ self.g(t, x.T).T)
 
 
 def _phi_functions(M: Array) -> tuple[Array, Array, Array, Array]:
