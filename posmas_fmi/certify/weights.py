@@ -84,6 +84,7 @@ def perron_weights(network: Network) -> Weights:
         solve = spla.splu(sp.csc_array(network.pinned_laplacian)).solve
     best = p_weights(network)
     nu, gained = best.nu, 0.0
+    enough = 1e-13 if network.N <= DIRECT_LIMIT else 1e-6  # a step costs a large solve there
     for _ in range(_STEPS if network.N <= 2000 else 10):
         nu = solve(nu)
         nu = nu / nu.max()
@@ -91,6 +92,6 @@ def perron_weights(network: Network) -> Weights:
             break
         tried = bounded(network, nu, "weight")
         gained, best = tried.rate - best.rate, tried if tried.rate > best.rate else best
-        if gained < 1e-13 * abs(best.rate):
+        if gained < enough * abs(best.rate):
             break
     return best
