@@ -201,11 +201,22 @@ class Agent:
 
     @cached_property
     def growth(self) -> Array:
-        """Growth bound c, ``|g_k(t, x)| ≤ c_k x_k`` on the region, (m,); inf if there is none."""
+        """Growth bound c, ``|g_k(t, x)| ≤ c_k x_k`` on the region, (m,); inf if there is none.
+
+        Positivity needs ``H g ≥ -|H| c x``; c_k is 0 where g_k and its column of H are
+        non-negative, however large they are (a heat load).
+        """
         if not isinstance(self.g, VectorFunction):
             return np.full(self.m, np.inf)
         ratios = (sympy.expand(e / symbol(f"x{k + 1}")) for k, e in enumerate(self.g.expressions))
-        return np.array([self._ratio_bound(e, k) for k, e in enumerate(ratios)])
+        return np.array(
+            [0.0 if self._only_adds(k) else self._ratio_bound(e, k) for k, e in enumerate(ratios)]
+        )
+
+    def _only_adds(self, k: int) -> bool:
+        assert isinstance(self.g, VectorFunction)
+        rising = bool((self.H[:, k] >= 0).all())
+        return rising and bounds(self.g.expressions[k], self.box(), (0.0, math.inf)).low >= 0
 
     def _ratio_bound(self, ratio: sympy.Expr, k: int) -> float:
         direct = bounds(ratio, self.box()).magnitude
@@ -294,7 +305,11 @@ class Agent:
         if not np.isfinite(c).all():
             detail = "no bound |g_k| <= c_k x_k found on the region"
             return Assumption(name, "declared", detail)
-        return Assumption(name, "verified", f"|g_k(t, x)| <= c_k x_k with c = {_numbers(c)}")
+        detail = f"|g_k(t, x)| <= c_k x_k with c = {_numbers(c)}"
+        if isinstance(self.g, VectorFunction):
+            adds = [k for k, e in enumerate(self.g.expressions) if e != 0 and self._only_adds(k)]
+            detail += "; 0 where H g only adds to the states" if adds else ""
+        return Assumption(name, "verified", detail)
 
     # -- python-control -----------------------------------------------------------------------
 

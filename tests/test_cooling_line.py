@@ -251,8 +251,18 @@ def test_the_agents_sec_is_the_exchangers(u: float) -> None:
 
 def test_the_agents_assumptions_are_verified() -> None:
     status = {a.name: a.status for a in AGENT.assumptions()}
-    assert status["sector"] == "verified"
-    assert status["lipschitz"] == "verified"
+    assert status == {"sector": "verified", "lipschitz": "verified", "growth": "verified"}
+
+
+def test_the_sampled_loop_of_a_row_is_certified() -> None:
+    from posmas_fmi.design import DesignSettings, design
+    from posmas_fmi.network import network_from_arcs
+
+    arcs = [((i - hop) % 8 + 1, i + 1) for i in range(8) for hop in (1, 3)]
+    network = network_from_arcs(8, arcs, pinned=[1])
+    made = design(AGENT, network, DesignSettings(method="contraction"), 5.0)
+    assert made.certificate.certified == "yes"
+    assert made.certificate.rate > 0
 
 
 def test_condition_13_holds_with_the_observer_gain_of_the_brief() -> None:
