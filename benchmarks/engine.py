@@ -34,12 +34,12 @@ from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.cosim.master import System
 from posmas_fmi.cosim.propagator import Propagator
-from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.compile import find_compiler, host
 from posmas_fmi.fmu.instance import FmuFile
 from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import network_from_arcs
+from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import load
 
 H = 0.001  # s

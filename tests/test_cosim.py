@@ -14,9 +14,9 @@ from posmas_fmi.cosim.continuous import continuous
 from posmas_fmi.cosim.master import System, simulate
 from posmas_fmi.cosim.plant import CallablePlant, ModelPlant
 from posmas_fmi.cosim.propagator import Propagator
-from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.errors import FmuCallError, InputError
 from posmas_fmi.network import network_from_arcs
+from posmas_fmi.protocol import make_protocol
 
 
 def system(agent, network, protocol, clock, xhat0, s0, **channel):

@@ -20,12 +20,12 @@ from posmas_fmi.cosim.channel import Arrivals, Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.cosim.master import Outcome, System
-from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.errors import BuildError, FmuCallError, InputError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu import build
 from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import Network, network_from_arcs
+from posmas_fmi.protocol import make_protocol
 
 TOLERANCE = 1e-12
 GAINS = {  # K and E by the number of states

@@ -15,7 +15,7 @@ from fmpy.validation import validate_fmu
 from fmu_examples import Example, example_1, tank, tank_fmu, wide
 
 from posmas_fmi import resources
-from posmas_fmi.errors import BuildError
+from posmas_fmi.errors import BuildError, InputError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu import compile as compiling
 from posmas_fmi.fmu.build import archive, build_plants, build_shipped, cache_folder, file_name, fmu
@@ -195,7 +195,8 @@ def test_shipped_scenarios_are_found_prebuilt(
     scenario(same, models, "two.toml", texts)  # other numbers, the same functions
     (models / "foreign.toml").write_text('[plant]\nfmu = "other.fmu"\n')
     paths = build_shipped(models, built)
-    assert len(paths) == len(set(paths)) == len(list(built.iterdir())) == 2
+    count = 2 + 2 * len(shipped_plants())
+    assert len(paths) == len(set(paths)) == len(list(built.iterdir())) == count
     monkeypatch.setattr(resources, "prebuilt", lambda: built)
     monkeypatch.setattr(compiling.subprocess, "run", no_compiler)
     assert example_1().fmu(2, tmp_path / "cache") in paths
@@ -234,7 +235,7 @@ def test_building_imports_nothing_but_numpy_sympy_attrs(tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-c", code, str(tmp_path), str(tmp_path / "out")], cwd=root, check=True
     )
-    assert len(list((tmp_path / "out").iterdir())) == 2
+    assert len(list((tmp_path / "out").iterdir())) == 2 + 2 * len(shipped_plants())
 
 
 def test_every_shipped_plant_builds_and_meets_its_reference(tmp_path: Path) -> None:
@@ -349,7 +350,7 @@ def test_platforms_and_versions_that_do_not_exist(
 
 
 def test_an_unknown_plant_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(BuildError, match="no plant 'nothing'"):
+    with pytest.raises(InputError, match="no plant 'nothing'"):
         build_plants(["nothing"], tmp_path)
 
 

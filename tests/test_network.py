@@ -100,7 +100,7 @@ def test_both_ways_to_the_perron_vector_agree(graph):
 
 
 def test_tiny_entries_of_the_perron_vector_keep_their_accuracy():
-    """A chain with weak arcs back: f spans 1e-72, each entry to machine precision (theory.md, section 5)."""
+    """A chain with weak arcs back: f spans 1e-72, each entry to machine precision."""
     n, weak = 13, 1e-6
     forward = [(k + 1, k, weak) for k in range(1, n)]
     arcs = forward + [(k, k + 1, 1.0) for k in range(1, n)]

@@ -10,9 +10,10 @@ import xarray
 
 from posmas_fmi import resources
 from posmas_fmi.cosim.continuous import continuous
-from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.errors import InputError, PosmasError
+from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario import load, run
+from posmas_fmi.scenario.plant import fmu_files
 
 FILES = {"results.nc", "design.json", "manifest.json", "summary.json", "report.html"}
 
@@ -207,6 +208,14 @@ def test_plants_that_do_not_fit_are_input_errors(tmp_path, old, new, place):
         run(changed(tmp_path, old, new), tmp_path / "out")
     assert place in str(caught.value)
     assert caught.value.exit_code == 2
+
+
+def test_every_shipped_plant_can_be_named(tmp_path):
+    """It is found, prebuilt or built; which of its variables are meant must be said."""
+    scenario = changed(tmp_path, '"positive_agent"', '"cooling_line"')
+    assert fmu_files(scenario)[0].name.startswith("cooling_line-fmi3-")
+    with pytest.raises(PosmasError, match=r"cooling_line.*there is no variable 'u\[1\]'"):
+        run(scenario, tmp_path / "out")
 
 
 def test_what_is_no_fmu_is_an_fmu_error(tmp_path):

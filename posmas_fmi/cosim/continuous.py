@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.cosim.protocol import Protocol
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
+from posmas_fmi.protocol import Protocol
 
 
 def continuous(
@@ -42,7 +42,7 @@ def continuous(
     Examples
     --------
     >>> from posmas_fmi.agent import linear_agent
-    >>> from posmas_fmi.cosim.protocol import make_protocol
+    >>> from posmas_fmi.protocol import make_protocol
     >>> from posmas_fmi.network import network_from_arcs
     >>> agent, one = linear_agent([[-1.0]], [[1.0]], [[1.0]]), network_from_arcs(1, [], [1])
     >>> protocol = make_protocol(one, K=[[-1.0]], E=[[0.0]], phi=1.0)

@@ -15,10 +15,10 @@ from posmas_fmi.cosim.channel import Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.propagator import Propagator
-from posmas_fmi.cosim.protocol import Protocol
 from posmas_fmi.errors import FmuCallError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
+from posmas_fmi.protocol import Protocol
 
 log = logging.getLogger(__name__)
 

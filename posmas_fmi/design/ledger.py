@@ -339,7 +339,7 @@ def _protocol_signs() -> Iterator[Entry]:
             "Protocol",
             f"{names[which]}; printed gains of Example 1, Algorithm {which}, t = 6",
             "reaches the leader, states non-negative",
-            f"error {bad.error:.3g}, least state {bad.least:.3g}",
+            f"error {bad.error:.0e}, least state {bad.least:.0e} (rounding decides the digits)",
             "contradicted" if bad.error > 1.0 and bad.least < 0 else "reproduced",
             f"{proofs[which]}: error {good.error:.2g}, least state {good.least:.3g}",
             erratum=which,

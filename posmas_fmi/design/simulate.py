@@ -7,6 +7,7 @@ import numpy as np
 
 from posmas_fmi.certify import Loop
 from posmas_fmi.expression import Array
+from posmas_fmi.protocol import make_protocol
 
 
 @attrs.frozen(eq=False)
@@ -47,25 +48,18 @@ def simulate(
         [s].
     """
     agent, network = loop.agent, loop.network
-    n, m = network.N, agent.m
-    L, d = network.laplacian, network.pinning[:, None]
-    sign = -1.0 if loop.protocol == "printed" else 1.0
-    EC = loop.E @ agent.C
-
-    def innovation(error: Array) -> Array:
-        if loop.observer == "local":
-            return np.asarray(error @ EC.T)
-        if loop.protocol == "printed":  # (22): d_i scales both, and the sign is that of ŷ - y
-            return np.asarray(-loop.mu * d * ((error + L @ error) @ EC.T))
-        return np.asarray(loop.mu * (L @ error + d * error) @ EC.T)
+    n, m, heard = network.N, agent.m, network.adjacency.indices
+    protocol = make_protocol(
+        network, loop.K, loop.E, loop.phi, loop.mu, loop.observer, loop.protocol
+    )
 
     def slope(t: float, z: Array) -> Array:
         x, xhat, s = z[:n], z[n : 2 * n], z[2 * n]
-        u = loop.phi * ((L @ xhat) + sign * d * (xhat - s)) @ loop.K.T
-        push = agent.sec_numpy(u) @ agent.B.T
+        push = agent.sec_numpy(protocol.control(xhat, xhat[heard], s)) @ agent.B.T
+        innovation = (x - xhat) @ agent.C.T
         free = z @ agent.A.T + agent.g_numpy(t, z) @ agent.H.T
         free[:n] += push
-        free[n : 2 * n] += push + innovation(x - xhat)
+        free[n : 2 * n] += push + protocol.injection(innovation, innovation[heard])
         return np.asarray(free)
 
     z = np.vstack([x, xhat, s[None]]).astype(float)

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from posmas_fmi import resources
@@ -148,7 +148,9 @@ def cache_folder() -> Path:
 
 
 def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
-    """Build the agents of all scenarios in a folder, FMI 2 and 3, for this machine.
+    """Build the agents of all scenarios in a folder and the shipped plants, for this machine.
+
+    Each as FMI 2 and FMI 3.
 
     Parameters
     ----------
@@ -167,15 +169,9 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
     BuildError
         If a scenario cannot be read or compiled.
     """
+    models = [*_agents_of(models_dir), *(read_plant(p) for p in shipped_plants().values())]
     paths: list[Path] = []
-    for file in sorted(models_dir.glob("*.toml")):
-        try:
-            agent = tomllib.loads(file.read_text(encoding="utf-8")).get("agent")
-        except (OSError, ValueError) as error:
-            raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
-        if not isinstance(agent, dict):
-            continue  # a scenario of plants that bring their own FMU
-        model = positive_agent(*agent_functions(agent, f"{file}: $.agent"))
+    for model in models:
         for fmi in (2, 3):
             version = _version(fmi)
             path = out_dir / file_name(model, version, (host(),))
@@ -185,6 +181,17 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
                 write(path, archive(model, version, (host(),)))
             paths.append(path)
     return paths
+
+
+def _agents_of(models_dir: Path) -> Iterator[FmuModel]:
+    for file in sorted(models_dir.glob("*.toml")):
+        try:
+            agent = tomllib.loads(file.read_text(encoding="utf-8")).get("agent")
+        except (OSError, ValueError) as error:
+            raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
+        if not isinstance(agent, dict):
+            continue  # a scenario of plants that bring their own FMU
+        yield positive_agent(*agent_functions(agent, f"{file}: $.agent"))
 
 
 def build_plants(

@@ -17,12 +17,12 @@ import numpy as np
 
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.master import Outcome, Progress, System
-from posmas_fmi.cosim.protocol import make_protocol
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
+from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.plant import fmu_files, make_plant
 from posmas_fmi.scenario.verdict import summarise

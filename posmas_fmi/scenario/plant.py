@@ -8,6 +8,8 @@ from typing import Any
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.errors import ScenarioError
 from posmas_fmi.expression import VectorFunction
+from posmas_fmi.fmu.build import agent_fmu, fmu
+from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.tables import Port
 
@@ -28,18 +30,25 @@ def fmu_files(scenario: Scenario) -> list[Path]:
 def _locate(scenario: Scenario, name: str) -> Path:
     if name == SHIPPED:
         return _agent_fmu(scenario)
+    plants = shipped_plants()
+    if name in plants:
+        return fmu(read_plant(plants[name]), scenario.plant.fmi)
     path = scenario.path.parent / name
     if not path.is_file():
         raise ScenarioError(
-            (("$.plant.fmu", f"there is no FMU {name!r}, shipped or beside the scenario"),),
+            (
+                (
+                    "$.plant.fmu",
+                    f"there is no FMU {name!r} beside the scenario, and none shipped of that name "
+                    f"({', '.join(plants)})",
+                ),
+            ),
             str(scenario.path),
         )
     return path
 
 
 def _agent_fmu(scenario: Scenario) -> Path:
-    from posmas_fmi.fmu.build import agent_fmu
-
     agent = scenario.agent
     assert isinstance(agent.g, VectorFunction)
     assert isinstance(agent.sec, VectorFunction)
