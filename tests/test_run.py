@@ -175,6 +175,17 @@ def test_the_fmus_follow_the_continuous_protocol_with_first_order(tmp_path):
     assert orders[-1] > 0.9, (errors, orders)
 
 
+def test_a_single_agent_is_a_network(tmp_path):
+    text = (resources.shipped("models") / "paper_example_1_tanh.toml").read_text(encoding="utf-8")
+    start, end = text.index("agents = 4"), text.index("pinned = [2]")
+    text = text[:start] + "agents = 1\narcs = []\n" + text[end:].replace("[2]", "[1]", 1)
+    path = tmp_path / "one.toml"
+    path.write_text(text, encoding="utf-8")
+    result = run(load(str(path)), tmp_path / "out")
+    assert result.good
+    assert result.design.certificate.certified == "yes"
+
+
 def test_the_run_works_by_path_from_anywhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = resources.shipped("models") / "paper_example_1.toml"

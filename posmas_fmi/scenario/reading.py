@@ -202,7 +202,7 @@ def _fits(value: Any, kind: Any) -> bool:
         if not isinstance(value, list):
             return False
         nested = typing.get_origin(typing.get_args(kind)[0]) is list
-        return nested == bool(value and isinstance(value[0], list))
+        return not value or nested == isinstance(value[0], list)
     if origin is dict or attrs.has(kind):
         return isinstance(value, dict)
     if kind in (float, int):
