@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from posmas_fmi.certify import Loop, certify_loop
-from posmas_fmi.certify.falsify import falsify
+from posmas_fmi.certify.drawn import draw_digraphs
+from posmas_fmi.certify.falsify import falsify, falsify_networks
 from posmas_fmi.design import DesignSettings, design
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2, Example
+from posmas_fmi.network import Network
 
 
 def printed(example: Example, which: int, protocol: str, pin: int = 2) -> Loop:
@@ -63,3 +65,55 @@ def test_distributed_observer_is_falsified_where_it_is_only_conditional() -> Non
 def test_a_loop_without_period_is_refused() -> None:
     with pytest.raises(ValueError, match="period"):
         falsify(attrs.evolve(printed(EXAMPLE_1, 1, "corrected"), period=None))
+
+
+@pytest.mark.parametrize(("agents", "p_max", "degree"), [(1, 5.0, 2.0), (6, 5.0, 2.0), (3, 0.5, 2)])
+def test_drawn_digraphs_are_covered(agents: int, p_max: float, degree: float) -> None:
+    found = draw_digraphs(agents, p_max, degree, 300, np.random.default_rng(0))
+    assert len(found.p) == 300
+    for a, d, p in zip(found.adjacency, found.pinning, found.p, strict=True):
+        network = Network(a, d)
+        assert network.p == pytest.approx(p, rel=1e-9)
+        assert network.p_max <= p_max * (1 + 1e-9)
+        assert 1 / degree <= p.min() * (1 + 1e-9)
+        assert network.pinned_laplacian.diagonal().max() <= degree * (1 + 1e-9)
+
+
+def test_drawn_digraphs_reach_both_bounds() -> None:
+    found = draw_digraphs(4, 5.0, 2.0, 300, np.random.default_rng(0))
+    own = (found.degree + found.d).max(axis=1)[:, 0]
+    assert np.isclose(own, 2.0).sum() > 50
+    assert np.isclose(found.p.max(axis=1), 5.0).sum() > 50
+    assert (found.adjacency > 0).any(axis=(1, 2)).sum() > 200
+
+
+def test_digraphs_closer_than_possible_are_refused() -> None:
+    with pytest.raises(ValueError, match="no digraph"):
+        draw_digraphs(3, 0.4, 2.0, 10, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("example", [EXAMPLE_1, EXAMPLE_2])
+def test_no_network_that_the_certificate_covers_breaks_it(example: Example) -> None:
+    made = design(example.agent("tanh"), example.network(2), DesignSettings(phi=example.phi), 0.005)
+    loop = Loop(example.agent("tanh"), made.network, made.K, made.E, phi=example.phi, period=0.005)
+    found = falsify_networks(loop, draws=2000, periods=40)
+    assert found.violations == ()
+    assert found.claimed_factor is not None
+    # the search comes close to the claim, so it would see a claim that is a little too strong
+    assert 0.999 * found.claimed_factor < found.worst_factor
+
+
+def test_too_strong_a_coupling_is_falsified() -> None:
+    agent = EXAMPLE_1.agent("tanh")
+    made = design(agent, EXAMPLE_1.network(2), DesignSettings(phi=10.0), 0.005)
+    loop = Loop(agent, made.network, made.K, made.E, phi=40.0, period=0.005)
+    found = falsify_networks(loop, draws=500)
+    assert found.least_state < -0.01
+
+
+@pytest.mark.parametrize("example", [EXAMPLE_1, EXAMPLE_2])
+@pytest.mark.parametrize("which", [1, 2])
+def test_printed_designs_are_falsified_on_drawn_networks(example: Example, which: int) -> None:
+    found = falsify_networks(printed(example, which, "printed"), draws=200)
+    assert any("falls to" in text for text in found.violations)
+    assert any("tracking error grows" in text for text in found.violations)

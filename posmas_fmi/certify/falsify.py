@@ -2,7 +2,8 @@
 
 Every draw is a loop that the certificate covers: ``g(t, x) = Θ(t) x`` with Θ switching inside the
 declared bounds, a sector gain of every input switching inside the sector, initial states, delays
-and losses of messages. A hit is a counterexample; no hits prove nothing.
+and losses of messages, and with `falsify_networks` the digraph and its pins. A hit is a
+counterexample; no hits prove nothing.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ import attrs
 import numpy as np
 
 from posmas_fmi.certify.closed_loop import Prover
+from posmas_fmi.certify.drawn import Digraphs, draw_digraphs
 from posmas_fmi.certify.loop import Loop
 from posmas_fmi.certify.weights import Weights
 from posmas_fmi.expression import Array
 from posmas_fmi.interval import Mask
+from posmas_fmi.network import Network
 
 _LIBRARY = 48  # distinct Θ per call
 _INSTANTS = 4  # of every period at which signs are looked at
 _TOLERANCE = 1e-9
 _BATCH = 2000
+_SAME_SIZE = 500  # draws in a row with the same number of agents
 
 
 @attrs.frozen
@@ -81,12 +85,73 @@ def falsify(
     """
     if loop.period is None:
         raise ValueError("expected a loop with a control period")
-    claims = _Claims(loop)
+    claims = _own_claims(loop)
+    graph = _Same(loop.network)
     rng = np.random.default_rng(seed)
     found = [
-        _Batch(loop, claims, rng, min(_BATCH, draws - k), max_delay, loss).run(periods)
+        _Batch(loop, graph, claims, rng, min(_BATCH, draws - k), max_delay, loss).run(periods)
         for k in range(0, draws, _BATCH)
     ]
+    return _judged(found, claims, draws, periods)
+
+
+def falsify_networks(
+    loop: Loop,
+    draws: int = 1000,
+    periods: int = 40,
+    seed: int = 0,
+    agents: tuple[int, int] = (1, 8),
+    max_delay: int = 3,
+    loss: float = 0.2,
+) -> Falsification:
+    """Search over digraphs and pins too: every draw has its own.
+
+    Certificate S of `loop` with the weights p covers every network, of any size, whose p is at
+    most p_max and whose (L_p)_ii is at most the largest of the network of `loop`; such networks are
+    drawn, weighted ones included, with the claims of that one certificate.
+
+    Parameters
+    ----------
+    loop : Loop
+        Agent, gains, period, and a network that says how far the certificate reaches.
+    draws, periods, seed : int
+    agents : (int, int)
+        Least and largest number of agents of a drawn network.
+    max_delay : int
+    loss : float
+        As in `falsify`.
+
+    Returns
+    -------
+    Falsification
+        `growth` is the largest over all networks.
+
+    Raises
+    ------
+    ValueError
+        If the loop has no period.
+    NetworkError
+        If the leader does not reach every agent of the network of `loop`.
+    """
+    if loop.period is None:
+        raise ValueError("expected a loop with a control period")
+    loop.network.require_reached()
+    rng = np.random.default_rng(seed)
+    degree = float((loop.network.in_degree + loop.network.pinning).max())
+    parts = _proved(loop, loop.weights)
+    claims, found = _Claims.nothing(1, loop.agent.m), []
+    for k in range(0, draws, _SAME_SIZE):
+        count = min(_SAME_SIZE, draws - k)
+        size = int(rng.integers(agents[0], agents[1] + 1))
+        graphs = draw_digraphs(size, loop.network.p_max, degree, count, rng)
+        claims = _Claims.of(parts, graphs.p, loop)
+        found.append(_Batch(loop, graphs, claims, rng, count, max_delay, loss).run(periods))
+    return _judged(found, claims, draws, periods)
+
+
+def _judged(
+    found: list[tuple[float, float, float, float]], claims: _Claims, draws: int, periods: int
+) -> Falsification:
     least = min(f[0] for f in found)
     tracking, observer = max(f[1] for f in found), max(f[2] for f in found)
     growth = max(f[3] for f in found)
@@ -109,35 +174,69 @@ def falsify(
     )  # fmt: skip
 
 
+class _Same:
+    """One network for all draws."""
+
+    def __init__(self, network: Network) -> None:
+        self.N, self.adjacency = network.N, network.adjacency
+        self.degree, self.d = network.in_degree[:, None], network.pinning[:, None]
+
+    def near(self, z: Array) -> Array:
+        """Add up over heard agents: ``Σ_j a_ij z_j``."""
+        draws, n, m = z.shape
+        columns = z.transpose(1, 0, 2).reshape(n, draws * m)
+        return np.asarray((self.adjacency @ columns).reshape(n, draws, m).transpose(1, 0, 2))
+
+
+@attrs.frozen(eq=False)
 class _Claims:
     """Norms and factors of the certificate; plain maximum norms where it claims nothing."""
 
-    def __init__(self, loop: Loop) -> None:
-        ones = Weights(np.ones(loop.network.N), 0.0, "")
-        held = loop.protocol == "corrected" and not loop.network.unreached()
-        weights = loop.weights_perron if held else ones
-        flat = np.ones((loop.network.N, loop.agent.m))
-        self.v, self.v_observer = flat, flat
-        self.factor: float | None = None
-        self.observer_factor: float | None = None
-        if not held:
-            return
-        h = loop.period
-        assert h is not None
-        for name, feedback in (
-            ("controller", loop.controller(weights)),
-            ("observer", loop.estimator(weights)),
-        ):
-            prover = Prover(loop, feedback, weights)
-            if prover.v is None or prover.rate is None:
-                continue
-            v, factor = weights.nu[:, None] * prover.v, float(np.exp(-prover.rate * h))
-            if name == "controller":
-                self.v, self.factor = v, factor
-            else:
-                local = loop.observer == "local"
-                self.v_observer = np.broadcast_to(prover.v, v.shape) if local else v
-                self.observer_factor = factor
+    v: Array
+    v_observer: Array
+    factor: float | None = None
+    observer_factor: float | None = None
+
+    @classmethod
+    def nothing(cls, agents: int, m: int) -> _Claims:
+        return cls(np.ones((agents, m)), np.ones((agents, m)))
+
+    @classmethod
+    def of(cls, parts: _Parts, nu: Array, loop: Loop) -> _Claims:
+        """Norms of agents with the weights `nu`, (..., N)."""
+        flat = np.ones((*nu.shape, loop.agent.m))
+        controller, observer = parts["controller"], parts["observer"]
+        spread = np.ones_like(nu) if loop.observer == "local" else nu
+        return cls(
+            flat if controller is None else nu[..., None] * controller[0],
+            flat if observer is None else spread[..., None] * observer[0],
+            None if controller is None else controller[1],
+            None if observer is None else observer[1],
+        )
+
+
+_Parts = dict[str, tuple[Array, float] | None]
+
+
+def _proved(loop: Loop, weights: Weights) -> _Parts:
+    """Weights v and factor r per period of each feedback; None where none is proved."""
+    assert loop.period is not None
+    parts: _Parts = {"controller": None, "observer": None}
+    if loop.protocol == "printed":
+        return parts
+    for feedback in (loop.controller(weights), loop.estimator(weights)):
+        prover = Prover(loop, feedback, weights)
+        if prover.v is not None and prover.rate is not None:
+            parts[feedback.name] = prover.v, float(np.exp(-prover.rate * loop.period))
+    return parts
+
+
+def _own_claims(loop: Loop) -> _Claims:
+    """Claims of the certificate for the network of the loop."""
+    if loop.protocol == "printed" or loop.network.unreached():
+        return _Claims.nothing(loop.network.N, loop.agent.m)
+    weights = loop.weights_perron
+    return _Claims.of(_proved(loop, weights), weights.nu, loop)
 
 
 class _Batch:
@@ -146,6 +245,7 @@ class _Batch:
     def __init__(
         self,
         loop: Loop,
+        graph: _Same | Digraphs,
         claims: _Claims,
         rng: np.random.Generator,
         draws: int,
@@ -153,7 +253,8 @@ class _Batch:
         loss: float,
     ) -> None:
         self.loop, self.claims, self.rng, self.draws = loop, claims, rng, draws
-        n, m = loop.network.N, loop.agent.m
+        self.graph = graph
+        n, m = graph.N, loop.agent.m
         self.Phi, self.Gamma = _library(loop, rng)
         kind = np.arange(draws) % 4  # 0, 1: exact estimates; 2, 3: estimates below; odd: delays
         self.delayed = (kind % 2 == 1) & (max_delay > 0)
@@ -198,25 +299,23 @@ class _Batch:
 
     def _step(self) -> float:
         loop, agent = self.loop, self.loop.agent
-        hears, d = loop.network.adjacency, loop.network.pinning[:, None]
+        graph, d = self.graph, self.graph.d
         sign = -1.0 if loop.protocol == "printed" else 1.0
         received = self._received()
-        degree = loop.network.in_degree[:, None]
-        near = np.stack([hears @ r for r in received])
-        w = degree * self.xhat - near + sign * d * (self.xhat - self.s)
+        w = graph.degree * self.xhat - graph.near(received) + sign * d * (self.xhat - self.s)
         u = loop.phi * w @ loop.K.T
         gains = self.rng.choice([agent.sector[0], agent.sector[1]], u.shape)
         push = (gains * u) @ agent.B.T
         e = self.x - self.xhat
         if loop.observer == "distributed":
-            e = loop.mu * (degree * e - np.stack([hears @ r for r in e]) + d * e)
+            e = loop.mu * (graph.degree * e - graph.near(e) + d * e)
         innovation = e @ (loop.E @ agent.C).T
         pick = self.rng.integers(0, len(self.Phi), self.draws)
         least = 0.0
         for k in range(_INSTANTS):
             Phi, Gamma = self.Phi[pick, k], self.Gamma[pick, k]
             x, xhat = (
-                np.einsum("dij,dnj->dni", Phi, z) + np.einsum("dij,dnj->dni", Gamma, p)
+                z @ Phi.transpose(0, 2, 1) + p @ Gamma.transpose(0, 2, 1)
                 for z, p in ((self.x, push), (self.xhat, push + innovation))
             )
             least = min(least, *(_least(z) for z in (x, xhat, x - xhat)))
