@@ -98,3 +98,44 @@ def test_printed_algorithm_1_of_example_2_is_not_positive() -> None:
     assert made.certificate.certified == "no"
     assert not made.certificate.positive
     assert made.notes
+
+
+def test_joint_form_is_where_the_alternation_has_not_arrived_after_six_rounds() -> None:
+    reading = Reading(coupling="L + D", order="rigorous")
+    found = algorithm(EXAMPLE_1.agent(), EXAMPLE_1.network(2), 1, settings(EXAMPLE_1), reading)
+    Pi, alpha = np.full(2, 2.0), np.inf
+    for _ in range(6):
+        alpha, E, _ = found.minimise(Pi, None, False)
+        _, _, Pi = found.minimise(None, E, False)
+    joint = found.joint(symmetric=False)
+    assert alpha == pytest.approx(-6.554, abs=1e-3)
+    assert joint.alpha == pytest.approx(-6.780, abs=1e-3)
+    # its α is that of its own E and Π, and step 3 at that Π gains nothing
+    assert found.minimise(joint.Pi, None, False)[0] == pytest.approx(joint.alpha, abs=1e-6)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_joint_form_satisfies_the_printed_conditions(symmetric: bool) -> None:
+    found = algorithm(EXAMPLE_1.agent(), EXAMPLE_1.network(2), 1, settings(EXAMPLE_1))
+    joint = found.joint(symmetric)
+    agent, P = found.agent, np.diag(joint.Pi)
+    EC, BB = joint.E @ agent.C, agent.B @ agent.B.T
+    off = ~np.eye(2, dtype=bool)
+    assert EC.min() >= -1e-6
+    assert (agent.A - EC)[off].min() >= -1e-6
+    assert (agent.A - found.feedback * BB @ np.linalg.inv(P))[off].min() >= -1e-4
+    assert np.allclose(joint.E, joint.E.T, atol=1e-9) == symmetric
+    for gamma, inverse_f, c in found.points:
+        top = (agent.A + agent.H) @ P + P @ (agent.A + agent.H).T - gamma * BB
+        top = top - found.delta * inverse_f * P @ P
+        side, low = (c * EC + agent.H) @ P, (agent.A - c * EC) @ P
+        block = np.block([[top, side], [side.T, low + low.T]])
+        assert np.linalg.eigvalsh(block)[-1] <= joint.alpha + 1e-6
+
+
+def test_joint_form_can_be_chosen() -> None:
+    example = EXAMPLE_1
+    chosen = settings(example, method="paper-1", form="joint")
+    made = design(example.agent("tanh"), example.network(2), chosen, 0.005)
+    assert made.form == "joint"
+    assert "joint" in made.notes[0]

@@ -1,6 +1,7 @@
 """Methods "paper-1" and "paper-2": Algorithms 1 and 2, for reproduction rather than for use.
 
-``form = "printed"`` follows the text. ``"corrected"`` keeps the quadratic idea with the errata of
+``form = "printed"`` follows the text, ``"joint"`` solves its steps 3 and 4 as one convex program.
+``"corrected"`` keeps the quadratic idea with the errata of
 theory.md put right, which is route L (`posmas_fmi.design.lmi`).
 """
 
@@ -24,6 +25,7 @@ from posmas_fmi.network import Network, generalised_connectivity
 
 FIRST_PI = 0.5  # the paper's choice in step 3, times I
 _ROUNDS = 10
+_TANGENTS = 50
 _LARGEST_PI = 2.0  # with Π free α has no minimum
 _SMALLEST_F = 1e-12
 
@@ -222,6 +224,56 @@ class Algorithm:
                 return Run(alpha, E, Pi, turn, len(self.points))
         return Run(alpha, E, Pi, _ROUNDS, len(self.points))
 
+    def joint(self, symmetric: bool) -> Run:
+        """Minimise α over E and Π at once, instead of steps 3 and 4 in turn.
+
+        The LMIs are linear in Π and ``X = ECΠ``. Any X is some E's where C has full column rank;
+        else, and for symmetric E, Π = πI and ``X = (πE)C``. What is left is ``ΠΣΠ/f = -δΠ²/f``,
+        concave in Π: its tangent lies above it, so each program proves its α, and the tangent at
+        the last Π lowers α from turn to turn. The limit is a stationary point of the whole problem,
+        its optimum but for that term.
+
+        Raises
+        ------
+        DesignError
+            If the sign conditions have no solution.
+        """
+        scalar = symmetric or np.linalg.matrix_rank(self.agent.C) < self.agent.m
+        Pi = np.full(self.agent.m, self.first_pi())
+        alpha, X, turns = np.inf, Pi, 0
+        while turns < _TANGENTS:
+            last, turns = alpha, turns + 1
+            alpha, X, Pi = self._tangent(Pi, scalar, symmetric)
+            if last - alpha <= 1e-7 * max(1.0, abs(alpha)):
+                break
+        E = X / Pi[0] if scalar else X / Pi @ np.linalg.pinv(self.agent.C)
+        return Run(alpha, E, Pi, turns, len(self.points))
+
+    def _tangent(self, at: Array, scalar: bool, symmetric: bool) -> tuple[float, Array, Array]:
+        """α, X (or πE) and Π of the convex program with ``Π²`` replaced by its tangent at `at`."""
+        cp = cvxpy()
+        A, H, B, C = self.agent.A, self.agent.H, self.agent.B, self.agent.C
+        m, q = self.agent.m, self.agent.q
+        alpha = cp.Variable()
+        pi = cp.Variable() * np.ones(m) if scalar else cp.Variable(m)
+        X = cp.Variable((m, q) if scalar else (m, m), symmetric=symmetric and m == q)
+        product, P, BB = X @ C if scalar else X, cp.diag(pi), B @ B.T
+        square = cp.diag(2 * cp.multiply(at, pi) - at**2)
+        limits = [product >= 0, pi >= 1e-6, pi <= max(_LARGEST_PI, self.first_pi())]
+        for gamma, inverse_f, c in self.points:
+            top = (A + H) @ P + P @ (A + H).T - gamma * BB - self.delta * inverse_f * square
+            side, low = c * product + H @ P, A @ P - c * product
+            block = cp.bmat([[top, side], [side.T, low + low.T]])
+            limits.append(block << alpha * np.eye(2 * m))
+        own, feedback = A @ P - self.strong * product, A @ P - self.feedback * BB
+        off = ~np.eye(m, dtype=bool)
+        limits += [cp.multiply(off, own) >= 0, cp.multiply(off, feedback) >= 0]
+        if not solve(cp.Problem(cp.Minimize(alpha), limits), "joint form of Algorithm 1 or 2"):
+            raise DesignError(
+                "the sign conditions of the paper's algorithm have no solution", "$.design"
+            )
+        return float(alpha.value), np.asarray(X.value), np.asarray(pi.value)
+
 
 def algorithm(
     agent: Agent,
@@ -286,7 +338,9 @@ def design(
                 '(erratum 3); use form = "corrected" or method = "contraction"',
                 "$.design.method",
             )
-    found = algorithm(agent, network, which, settings).run(symmetric=True)
+    conditions = algorithm(agent, network, which, settings)
+    joint = settings.form == "joint"
+    found = conditions.joint(symmetric=False) if joint else conditions.run(symmetric=True)
     if found.alpha > 0:
         raise DesignError(
             f"Algorithm {which} stops at alpha = {found.alpha:.4g} > 0 after {found.rounds} "
@@ -296,7 +350,8 @@ def design(
     E = nearest(found.E, settings.digits, relative_zero=1e-6)
     K = nearest(-settings.eta * agent.B.T * found.Pi, settings.digits)
     notes = (
-        f"Algorithm {which} as printed: alpha = {found.alpha:.6g}, Pi = {found.Pi.tolist()}, "
+        f"Algorithm {which} {'in joint form' if joint else 'as printed'}: "
+        f"alpha = {found.alpha:.6g}, Pi = {found.Pi.tolist()}, "
         f"{found.lmis} of {network.N} LMIs can be active, K = -eta B^T Pi",
         "the paper's conditions do not prove the closed loop (errata 3 to 9); the certificate is "
         "that of theory.md, section 4",

@@ -47,7 +47,7 @@ class Design:
     baseline : Baseline
     protocol : {"corrected", "printed"}
         Signs that the running controller uses (errata 1 and 2).
-    form : {"corrected", "printed"}
+    form : {"corrected", "printed", "joint"}
         Form of the paper's algorithms, where one was used.
     notes : tuple of str
         What a reader should know about how the gains came about.
@@ -63,7 +63,7 @@ class Design:
     certificate: Certificate
     baseline: Baseline
     protocol: Literal["corrected", "printed"] = "corrected"
-    form: Literal["corrected", "printed"] = "corrected"
+    form: Literal["corrected", "printed", "joint"] = "corrected"
     notes: tuple[str, ...] = ()
 
     @property

@@ -72,8 +72,9 @@ class DesignSettings:
         Limit of ``|u|``, for the certified region of attraction.
     eta, delta : float
         Constants of Algorithms 1 and 2.
-    form : {"corrected", "printed"}
-        Form of Algorithms 1 and 2.
+    form : {"corrected", "printed", "joint"}
+        Form of Algorithms 1 and 2: route L in their place; as printed; the printed conditions with
+        steps 3 and 4 solved jointly.
     protocol : {"corrected", "printed"}
         Signs in the running controller: L + D, or as printed (errata 1 and 2).
     digits : int
@@ -116,8 +117,8 @@ class DesignSettings:
     saturation: float | None = attrs.field(default=None, validator=_positive)
     eta: float = attrs.field(default=0.6, validator=_positive)
     delta: float = attrs.field(default=0.02, validator=_positive)
-    form: Literal["corrected", "printed"] = attrs.field(
-        default="corrected", validator=_one_of("corrected", "printed")
+    form: Literal["corrected", "printed", "joint"] = attrs.field(
+        default="corrected", validator=_one_of("corrected", "printed", "joint")
     )
     protocol: Literal["corrected", "printed"] = attrs.field(
         default="corrected", validator=_one_of("corrected", "printed")
