@@ -7,6 +7,7 @@ from scipy.linalg import expm
 
 from posmas_fmi.certify import Loop, certify_loop
 from posmas_fmi.certify.band import guaranteed_band
+from posmas_fmi.certify.closed_loop import Prover
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.design import DesignSettings, design
 from posmas_fmi.design.paper_examples import EXAMPLE_1
@@ -80,6 +81,63 @@ def test_region_of_attraction_keeps_inputs_in_the_sector() -> None:
         delta = rng.choice([-1.0, 1.0], (4, 2)) * region.radius
         u = LOOP.phi * L_p @ delta @ LOOP.K.T
         assert np.abs(u).max() <= limit / LOOP.agent.sector[0] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("observer", ["local", "distributed"])
+@pytest.mark.parametrize("period", [0.005, None])
+def test_region_of_attraction_is_invariant_with_estimation_errors(
+    observer: str, period: float | None
+) -> None:
+    """Worst sector gains and Θ, start on the boundary: δ stays in its box while e drives it."""
+    limit, h = 2.0, period or 1e-4
+    loop = attrs.evolve(LOOP, observer=observer, mu=15.0, period=period)
+    if observer == "distributed":
+        given = DesignSettings(phi=10.0, observer="distributed", mu=15.0)
+        loop = attrs.evolve(loop, E=design(loop.agent, loop.network, given, 0.005).E)
+    certificate = certify_loop(loop, saturation=limit)
+    region = certificate.region_of_attraction
+    assert region is not None
+    assert 0 < region.radius_estimation < np.inf
+    sharp, plain = loop.weights_perron, loop.weights
+    observing = Prover(loop, loop.estimator(sharp), sharp).contraction
+    tracking = Prover(loop, loop.controller(plain), plain).contraction
+    box = region.c * np.outer(tracking.nu, tracking.v)
+    box_e = region.c_estimation * np.outer(observing.nu, observing.v)
+    agent, rng = loop.agent, np.random.default_rng(4)
+    L_p = loop.network.pinned_laplacian.toarray()
+    M = np.eye(4) if observer == "local" else loop.mu * L_p
+    for draw in range(8):
+        sign = 1.0 if draw == 0 else rng.choice([-1.0, 1.0], (4, 2))
+        delta, e = sign * box, sign * box_e
+        for _ in range(25):
+            Phi, Gamma, gains = periods(rng, attrs.evolve(loop, period=h))
+            u = loop.phi * (L_p @ delta @ loop.K.T)
+            assert np.abs(u).max() <= limit / agent.sector[0] * (1 + 1e-9)
+            innovation = M @ e @ (loop.E @ agent.C).T
+            push = gains * u @ agent.B.T + innovation
+            delta, e = (
+                np.einsum("nij,nj->ni", Phi, z) + np.einsum("nij,nj->ni", Gamma, w)
+                for z, w in ((delta, push), (e, -innovation))
+            )
+            assert (np.abs(delta) <= box * (1 + 1e-9)).all()
+            assert (np.abs(e) <= box_e * (1 + 1e-9)).all()
+
+
+def test_larger_estimation_errors_leave_the_region() -> None:
+    """The bound on e is needed: some multiple of it pushes δ out of its box within a period."""
+    region = certify_loop(LOOP, saturation=2.0).region_of_attraction
+    assert region is not None
+    plain, sharp = LOOP.weights, LOOP.weights_perron
+    tracking = Prover(LOOP, LOOP.controller(plain), plain).contraction
+    observing = Prover(LOOP, LOOP.estimator(sharp), sharp).contraction
+    delta = region.c * np.outer(tracking.nu, tracking.v)
+    e = 2.0 * region.c_estimation * np.outer(observing.nu, observing.v)
+    agent = LOOP.agent
+    W = expm(np.block([[agent.A + np.abs(agent.H), np.eye(2)], [np.zeros((2, 4))]]) * 0.005)
+    u = agent.sector[0] * LOOP.phi * (LOOP.network.pinned_laplacian @ delta @ LOOP.K.T)
+    push = u @ agent.B.T + e @ (LOOP.E @ agent.C).T
+    after = delta @ W[:2, :2].T + push @ W[:2, 2:].T
+    assert (after > delta).any()
 
 
 def test_band_objective_is_not_wider_than_the_fastest_design() -> None:

@@ -68,15 +68,22 @@ class Region:
     Attributes
     ----------
     c : float
-        Start with ``|δ_i| ≤ c v_i`` for every agent, where δ is the tracking error.
+        Start with ``|δ_i| ≤ c v_i`` for every agent, where δ is the tracking error of the estimate.
     radius : float
         Largest box in it: every entry of every ``|δ_i|`` at most this.
+    c_estimation : float
+        And with ``|e_i| ≤ c_estimation w_i``, where e is the estimation error and w the weights of
+        the observer's certificate.
+    radius_estimation : float
+        Largest box in that: every entry of every ``|e_i|`` at most this.
     detail : str
         How it was obtained.
     """
 
     c: float
     radius: float
+    c_estimation: float
+    radius_estimation: float
     detail: str
 
 
@@ -163,6 +170,8 @@ class Certificate:
             else {
                 "c": json_number(region.c),
                 "radius": json_number(region.radius),
+                "c_estimation": json_number(region.c_estimation),
+                "radius_estimation": json_number(region.radius_estimation),
                 "detail": region.detail,
             },
             "band": None if self.band is None else [json_list(row) for row in self.band],

@@ -18,7 +18,7 @@ from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.certify.positivity import between_samples, gain_sign, metzler, non_positive_gain
 from posmas_fmi.certify.sampled import contracts, rate_of, sampled_factor
-from posmas_fmi.certify.saturation import region_of_attraction
+from posmas_fmi.certify.saturation import Contraction, region_of_attraction
 from posmas_fmi.certify.weights import Weights
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
@@ -71,8 +71,10 @@ def certify_loop(
     holds = all(c.holds for c in conditions)
     band = guaranteed_band(loop, disturbance) if holds and disturbance is not None else None
     region = None
-    if holds and saturation is not None and controller.v is not None:
-        region = region_of_attraction(loop, chosen, controller.v, saturation)
+    if holds and saturation is not None:
+        region = region_of_attraction(
+            loop, controller.contraction, observer.contraction, saturation
+        )
     return Certificate(
         assumptions=assumptions(loop),
         conditions=conditions,
@@ -126,6 +128,15 @@ class Prover:
             rate = rate_of(factor, loop.period)
         self.rate = rate
         self.v = None if proved is None else proved.v
+
+    @property
+    def contraction(self) -> Contraction:
+        """What certificate R takes from a feedback that contracts."""
+        assert self.v is not None
+        assert self.rate is not None
+        local = self.feedback.name == "observer" and self.loop.observer == "local"
+        nu = np.ones_like(self.weights.nu) if local else self.weights.nu
+        return Contraction(nu, self.v, self.rate)
 
     @property
     def proved(self) -> bool:
