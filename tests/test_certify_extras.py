@@ -88,7 +88,7 @@ def test_region_of_attraction_keeps_inputs_in_the_sector() -> None:
 def test_region_of_attraction_is_invariant_with_estimation_errors(
     observer: str, period: float | None
 ) -> None:
-    """Worst sector gains and Θ, start on the boundary: δ stays in its box while e drives it."""
+    """Worst sector gains and Θ, start on the boundary: the region is never left."""
     limit, h = 2.0, period or 1e-4
     loop = attrs.evolve(LOOP, observer=observer, mu=15.0, period=period)
     if observer == "distributed":
@@ -108,7 +108,8 @@ def test_region_of_attraction_is_invariant_with_estimation_errors(
     M = np.eye(4) if observer == "local" else loop.mu * L_p
     for draw in range(8):
         sign = 1.0 if draw == 0 else rng.choice([-1.0, 1.0], (4, 2))
-        delta, e = sign * box, sign * box_e
+        share = rng.random()
+        delta, e = sign * share * box, sign * (1 - share) * box_e
         for _ in range(25):
             Phi, Gamma, gains = periods(rng, attrs.evolve(loop, period=h))
             u = loop.phi * (L_p @ delta @ loop.K.T)
@@ -119,19 +120,18 @@ def test_region_of_attraction_is_invariant_with_estimation_errors(
                 np.einsum("nij,nj->ni", Phi, z) + np.einsum("nij,nj->ni", Gamma, w)
                 for z, w in ((delta, push), (e, -innovation))
             )
-            assert (np.abs(delta) <= box * (1 + 1e-9)).all()
-            assert (np.abs(e) <= box_e * (1 + 1e-9)).all()
+            assert (np.abs(delta) / box).max() + (np.abs(e) / box_e).max() <= 1 + 1e-9
 
 
 def test_larger_estimation_errors_leave_the_region() -> None:
-    """The bound on e is needed: some multiple of it pushes δ out of its box within a period."""
+    """Outside, with both shares 1, e pushes δ beyond c within a period."""
     region = certify_loop(LOOP, saturation=2.0).region_of_attraction
     assert region is not None
     plain, sharp = LOOP.weights, LOOP.weights_perron
     tracking = Prover(LOOP, LOOP.controller(plain), plain).contraction
     observing = Prover(LOOP, LOOP.estimator(sharp), sharp).contraction
     delta = region.c * np.outer(tracking.nu, tracking.v)
-    e = 2.0 * region.c_estimation * np.outer(observing.nu, observing.v)
+    e = region.c_estimation * np.outer(observing.nu, observing.v)
     agent = LOOP.agent
     W = expm(np.block([[agent.A + np.abs(agent.H), np.eye(2)], [np.zeros((2, 4))]]) * 0.005)
     u = agent.sector[0] * LOOP.phi * (LOOP.network.pinned_laplacian @ delta @ LOOP.K.T)

@@ -68,12 +68,13 @@ class Region:
     Attributes
     ----------
     c : float
-        Start with ``|δ_i| ≤ c v_i`` for every agent, where δ is the tracking error of the estimate.
+        With exact estimates start with ``|δ_i| ≤ c v_i`` for every agent, where δ is the tracking
+        error of the estimate.
     radius : float
         Largest box in it: every entry of every ``|δ_i|`` at most this.
     c_estimation : float
-        And with ``|e_i| ≤ c_estimation w_i``, where e is the estimation error and w the weights of
-        the observer's certificate.
+        With an estimation error e, ``max |δ_i|/v_i / c + max |e_i|/w_i / c_estimation ≤ 1``, where
+        w are the weights of the observer's certificate.
     radius_estimation : float
         Largest box in that: every entry of every ``|e_i|`` at most this.
     detail : str

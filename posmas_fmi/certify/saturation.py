@@ -41,14 +41,14 @@ def region_of_attraction(
 
     A saturation at `limit` is in ``[m_l, 1]`` only while ``|u| ≤ limit/m_l``, and
     ``|u_i| ≤ φ|K| v c Σ_j |(L_p)_ij| ν_j`` while ``|δ_i| ≤ c ν_i v``. Inputs cancel in the
-    estimation error, so ``|e_i| ≤ c_e w_i`` is invariant by the observer's certificate alone. It
-    drives δ through the innovation: with b the largest push on δ, in the norm of δ, of an e with
-    ``|e_i| ≤ w_i``, the box of δ is invariant if
+    estimation error, which falls by r_o in a period whatever they are. It drives δ through the
+    innovation: let b be the largest push on δ of an e with ``|e_i| ≤ w_i``, in the norm of δ:
+    ``Γ(A_high) |EC| w`` over a period, or ``|EC| w`` in continuous time. With ``κ = b/(1 - r_o)``
 
-    - sampled, ``r c + b c_e ≤ c``, where the push is ``Γ(A_high) |EC| w`` over a period,
-    - continuous, ``-ρ c + b c_e ≤ 0``, where it is ``|EC| w``.
+        ``‖δ‖' + κ‖e‖' ≤ r‖δ‖ + b‖e‖ + κ r_o‖e‖ = r‖δ‖ + κ‖e‖``,
 
-    Then e tends to zero, and so does δ.
+    so ``‖δ‖ + κ‖e‖ ≤ c`` is invariant, that is ``‖δ‖/c + ‖e‖/c_e ≤ 1`` with ``c_e = c/κ``; in
+    continuous time the same with the rate ρ_o for ``1 - r_o``. e tends to zero, and so does δ.
 
     Parameters
     ----------
@@ -65,23 +65,24 @@ def region_of_attraction(
         return Region(np.inf, np.inf, np.inf, np.inf, "the input never leaves its sector")
     c = limit / low / per_c / _UP
     push = _push(loop, tracking, estimation)
-    c_e = c * _left(tracking.rate, loop.period) / push / _UP if push > 0 else math.inf
+    c_e = c * _left(estimation.rate, loop.period) / push / _UP if push > 0 else math.inf
     worst = int(coupling.argmax())
     weights = _shown(estimation.v) + ("" if loop.observer == "local" else " nu_i")
-    radius_e = c_e * float(estimation.nu.min() * estimation.v.min())
+    radius_e = float(c_e) * float(estimation.nu.min() * estimation.v.min())
     return Region(
         float(c),
-        c * float(tracking.nu.min() * tracking.v.min()),
+        float(c) * float(tracking.nu.min() * tracking.v.min()),
         float(c_e),
         radius_e,
         f"|u| <= {limit:g}/{low:g} while |delta_i| <= c nu_i v0, v0 = {_shown(tracking.v)}; "
-        f"largest input at agent {loop.network.names[worst]}; holds for estimation errors "
-        f"|e_i| <= {c_e:.6g} w_i, w_i = {weights}: up to {radius_e:.3g} in every entry",
+        f"largest input at agent {loop.network.names[worst]}; that is for e = 0: with an "
+        f"estimation error the share |delta|/c + |e|/c_e must start at most 1, where "
+        f"|e| = max |e_i|/w_i, w_i = {weights}, c_e = {c_e:.6g}",
     )
 
 
 def _left(rate: float, h: float | None) -> float:
-    """How much of c the contraction leaves to the push: 1 - r, or ρ; rounded down."""
+    """``1 - r``, or ρ, rounded down."""
     return (rate if h is None else -math.expm1(-rate * h)) / _UP
 
 
