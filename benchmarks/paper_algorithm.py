@@ -74,6 +74,6 @@ if __name__ == "__main__":
     print(f"ratio {naive / fast:.0f}")
     if given.whole:
         begin = time.perf_counter()
-        full, *_ = algorithm(gamma, inverse).minimise(PI, None, True)
+        full, _, _ = algorithm(gamma, inverse).minimise(PI, None, True)
         slow = time.perf_counter() - begin
         print(f"one program with all: {slow:.1f} s, alpha {full:.9f}, ratio {slow / fast:.0f}")
