@@ -73,3 +73,15 @@ def test_a_panic_of_the_solver_is_a_clear_error() -> None:
 
     with pytest.raises(DesignError, match="panicked"):
         solver.solve(Broken(), "feedback")
+
+
+def test_a_solver_that_does_not_finish_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    from posmas_fmi.design import solver
+
+    monkeypatch.setattr(solver, "TIME_LIMIT", 1e-9)
+    cp = solver.cvxpy()
+    X = cp.Variable((20, 20), PSD=True)
+    seed = np.random.default_rng(0).normal(size=(20, 20))
+    program = cp.Problem(cp.Minimize(cp.trace(X)), [X >> seed @ seed.T])
+    with pytest.raises(DesignError, match="not done after"):
+        solver.solve(program, "feedback")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from typing import Any
 
 from posmas_fmi.errors import DesignError
 
 _USABLE = ("optimal", "optimal_inaccurate")
+_UNFINISHED = ("user_limit", "user_limit_inaccurate")
+TIME_LIMIT = 120.0  # s for one program
 
 
 def cvxpy() -> Any:
@@ -32,11 +35,14 @@ def solve(problem: Any, what: str) -> bool:
     Raises
     ------
     DesignError
-        If the solver breaks down.
+        If the solver breaks down or does not finish in `TIME_LIMIT`.
     """
     cp = cvxpy()
     try:
-        problem.solve(solver=cp.CLARABEL)
+        with warnings.catch_warnings():
+            # whether a point is good enough is for the proof to say
+            warnings.filterwarnings("ignore", "Solution may be inaccurate", UserWarning)
+            problem.solve(solver=cp.CLARABEL, time_limit=TIME_LIMIT)
     except cp.error.SolverError as error:
         raise DesignError(f"{what}: the solver failed ({error})", "$.design.method") from error
     except BaseException as error:
@@ -48,4 +54,10 @@ def solve(problem: Any, what: str) -> bool:
                 "$.design.method",
             ) from None
         raise
+    if problem.status in _UNFINISHED:
+        raise DesignError(
+            f"{what}: the solver was not done after {TIME_LIMIT:g} s; the contraction design "
+            "needs no such program",
+            "$.design.method",
+        )
     return problem.status in _USABLE
