@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -102,22 +102,12 @@ class Agent:
     region: Mapping[str, tuple[float, float]] = attrs.field(factory=dict)
 
     def __attrs_post_init__(self) -> None:
-        _check_matrices(self)
-        _check_functions(self)
-        low, high = self.sector
-        if not 0.0 <= low <= high < math.inf:
-            raise AgentError(
-                f"expected 0 <= m_l <= m_h < inf (got [{low:g}, {high:g}])", "$.agent.sector"
-            )
-        if self.lipschitz is not None:
-            declared = np.atleast_1d(np.asarray(self.lipschitz, dtype=float))
-            if declared.size not in (1, self.m) or not (
-                np.isfinite(declared).all() and (declared >= 0).all()
-            ):
-                raise AgentError(
-                    f"expected one finite bound >= 0, or {self.m} (got {self.lipschitz!r})",
-                    "$.agent.lipschitz",
-                )
+        found = [*_matrix_errors(self), *_bound_errors(self)]
+        if self.A.ndim == self.B.ndim == 2:
+            found += _function_errors(self)
+        if found:
+            found[0].problems = tuple((error.where, error.message) for error in found)
+            raise found[0]
 
     @property
     def m(self) -> int:
@@ -429,7 +419,7 @@ def _point(at: Mapping[str, float]) -> str:
     return ", ".join(f"{name} = {value:.4g}" for name, value in sorted(at.items())) or "any point"
 
 
-def _check_matrices(agent: Agent) -> None:
+def _matrix_errors(agent: Agent) -> Iterator[AgentError]:
     m = agent.A.shape[0] if agent.A.ndim == 2 else 0
     p = agent.B.shape[1] if agent.B.ndim == 2 else 0
     q = agent.C.shape[0] if agent.C.ndim == 2 else 0
@@ -444,46 +434,63 @@ def _check_matrices(agent: Agent) -> None:
         place = f"$.agent.{name}"
         if value.shape != shape or value.size == 0:
             wanted = f"{words} with m = {m}" if m else words
-            raise AgentError(f"expected a matrix of shape {wanted} (got {value.shape})", place)
-        if not np.isfinite(value).all():
+            yield AgentError(f"expected a matrix of shape {wanted} (got {value.shape})", place)
+        elif not np.isfinite(value).all():
             i, j = np.argwhere(~np.isfinite(value))[0]
-            raise AgentError(f"expected finite numbers (got {value[i, j]})", f"{place}[{i}][{j}]")
-    off = agent.A - np.diag(np.diag(agent.A))
+            yield AgentError(f"expected finite numbers (got {value[i, j]})", f"{place}[{i}][{j}]")
+    off = agent.A - np.diag(np.diag(agent.A)) if m and m == agent.A.shape[1] else np.eye(1)
     if (off < 0).any():
         i, j = np.argwhere(off < 0)[0]
-        raise AgentError(
+        yield AgentError(
             "A must be Metzler, that is have no negative entry off its diagonal "
             f"(got {agent.A[i, j]:g}); a positive system needs it, check the sign or the states",
             f"$.agent.A[{i}][{j}]",
         )
-    if (agent.B < 0).any():
+    if agent.B.ndim == 2 and (agent.B < 0).any():
         i, j = np.argwhere(agent.B < 0)[0]
-        raise AgentError(
+        yield AgentError(
             f"B must be non-negative (got {agent.B[i, j]:g}); redefine the input with the "
             "opposite sign if all of its column is negative",
             f"$.agent.B[{i}][{j}]",
         )
 
 
-def _check_functions(agent: Agent) -> None:
+def _function_errors(agent: Agent) -> Iterator[AgentError]:
     for name, count, shape in (("g", agent.m, "state"), ("sec", agent.p, "input")):
         value = getattr(agent, name)
         if isinstance(value, VectorFunction):
             if len(value) != count:
-                raise AgentError(
+                yield AgentError(
                     f"expected {count} expression(s), one per {shape} (got {len(value)})",
                     f"$.agent.{name}",
                 )
         elif not callable(value):
-            raise AgentError(
+            yield AgentError(
                 f"expected expressions or a callable (got {value!r})", f"$.agent.{name}"
             )
     if isinstance(agent.sec, VectorFunction):
         for k, e in enumerate(agent.sec.expressions):
             others = {str(s) for s in e.free_symbols} - {f"u{k + 1}"}
             if others:
-                raise AgentError(
+                yield AgentError(
                     f"sec is elementwise: expected a function of u{k + 1} only "
                     f"(got {', '.join(sorted(others))} as well)",
                     f"$.agent.sec[{k}]",
                 )
+
+
+def _bound_errors(agent: Agent) -> Iterator[AgentError]:
+    low, high = agent.sector
+    if not 0.0 <= low <= high < math.inf:
+        yield AgentError(
+            f"expected 0 <= m_l <= m_h < inf (got [{low:g}, {high:g}])", "$.agent.sector"
+        )
+    if agent.lipschitz is None:
+        return
+    declared = np.atleast_1d(np.asarray(agent.lipschitz, dtype=float))
+    sizes = {1, *agent.A.shape[:1]}
+    if declared.size not in sizes or not (np.isfinite(declared).all() and (declared >= 0).all()):
+        yield AgentError(
+            f"expected one finite bound >= 0, or one per state (got {agent.lipschitz!r})",
+            "$.agent.lipschitz",
+        )

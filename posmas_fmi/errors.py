@@ -25,6 +25,8 @@ class PosmasError(Exception):
         super().__init__(message, where)
         self.message = message
         self.where = where
+        # (place, message) of every mistake found together; this error is about the first
+        self.problems: tuple[tuple[str, str], ...] = ((where, message),)
 
     def __str__(self) -> str:
         return f"{self.where}: {self.message}" if self.where else self.message
@@ -58,10 +60,10 @@ class ScenarioError(InputError):
     """
 
     def __init__(self, problems: tuple[tuple[str, str], ...], where: str = "") -> None:
-        self.problems = problems
         lines = [f"{place}: {text}" for place, text in problems]
         message = lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
         super().__init__(message, where)
+        self.problems = problems
 
 
 class NotBuiltError(InputError):

@@ -109,7 +109,7 @@ def test_callables_are_accepted_and_nothing_is_claimed_about_them():
         ({"C": [[1.0]]}, "$.agent.C", "one column per state with m = 2"),
         ({"H": [[np.nan, 0.0], [0.0, 0.0]]}, "$.agent.H[0][0]", "nan"),
         ({"sector": (0.5, 0.2)}, "$.agent.sector", "m_l"),
-        ({"lipschitz": [1.0, 2.0, 3.0]}, "$.agent.lipschitz", "2"),
+        ({"lipschitz": [1.0, 2.0, 3.0]}, "$.agent.lipschitz", "one per state"),
         ({"lipschitz": -1.0}, "$.agent.lipschitz", "-1.0"),
         ({"g": VectorFunction.parse(["0"], state_names(2))}, "$.agent.g", "2 expression"),
         ({"sec": "u1"}, "$.agent.sec", "callable"),
@@ -124,6 +124,35 @@ def test_what_is_no_positive_agent_is_refused_by_name(change, place, word):
         Agent(**good | change)
     assert caught.value.where == place
     assert word in caught.value.message
+
+
+def test_all_mistakes_of_an_agent_are_found_together():
+    with pytest.raises(AgentError) as caught:
+        Agent(
+            A=[[-1.0, -2.0], [1.0, -1.0]],
+            H=[[0.0]],
+            B=[[1.0], [-1.0]],
+            C=[[1.0]],
+            g=VectorFunction.parse(["0"], state_names(2)),
+            sec=VectorFunction.parse(["u1"], ["u1"]),
+            sector=(2.0, 1.0),
+        )
+    assert {place for place, _ in caught.value.problems} == {
+        "$.agent.A[0][1]", "$.agent.H", "$.agent.B[1][0]", "$.agent.C", "$.agent.g",
+        "$.agent.sector",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", [3.0, [1.0, 2.0], [[[1.0]]], []])
+@pytest.mark.parametrize("name", ["A", "B", "C", "H"])
+def test_what_is_no_matrix_is_named(name, wrong):
+    functions = {
+        "g": VectorFunction.parse(paper.G, state_names(2)),
+        "sec": VectorFunction.parse(paper.SEC, ["u1"]),
+    }
+    with pytest.raises(AgentError) as caught:
+        Agent(**paper.MATRICES[1] | {name: wrong} | functions)
+    assert f"$.agent.{name}" in {place for place, _ in caught.value.problems}
 
 
 def test_sec_must_be_elementwise():

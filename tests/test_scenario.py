@@ -91,6 +91,13 @@ def test_all_mistakes_of_a_file_are_reported_at_once(tmp_path):
     # what depends on agent and network can only be checked once those are right
 
 
+def test_unknown_design_keys_are_reported_with_mistakes_of_form(tmp_path):
+    text = TEXT.replace("phi = 10.0", "phy = 10.0").replace("[10.3, -9.84]", "[nan, -9.84]")
+    with pytest.raises(ScenarioError) as caught:
+        load(write(tmp_path, text))
+    assert {place for place, _ in caught.value.problems} == {"$.agent.A[1][0]", "$.design.phy"}
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"\x00\x01\xff\xfe" * 100, b"\x7fELF" + bytes(1000), "x = \u2603".encode("utf-16")],

@@ -217,10 +217,8 @@ class _Builder:
     def attempt(self, make: Callable[[], T]) -> T | None:
         try:
             return make()
-        except ScenarioError as error:
-            self.problems += error.problems
         except PosmasError as error:
-            self.problems.append((error.where or "$", error.message))
+            self.problems += [(place or "$", message) for place, message in error.problems]
         return None
 
     def check_name(self) -> None:
@@ -350,21 +348,12 @@ def _check_pins(pinned: list[int], agents: int) -> None:
 
 
 def make_design(table: dict[str, Any]) -> DesignSettings:
-    """Build the design settings; unknown keys are refused with the nearest known one.
+    """Build the design settings.
 
     Raises
     ------
     InputError
     """
-    known = [a.name for a in attrs.fields(DesignSettings)]
-    unknown = [key for key in table if key not in known]
-    if unknown:
-        problems = []
-        for key in unknown:
-            near = get_close_matches(key, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"known keys: {', '.join(known)}"
-            problems.append((f"$.design.{key}", f"unknown key; {hint}"))
-        raise ScenarioError(tuple(problems))
     return DesignSettings(**table)
 
 

@@ -20,6 +20,7 @@ from cattrs.errors import (
     IterableValidationNote,
 )
 
+from posmas_fmi.design import DesignSettings
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.scenario.tables import Count, Port, ScenarioFile, Uniform
 
@@ -57,10 +58,21 @@ def read_tables(path: Path) -> tuple[ScenarioFile, str]:
         raise InputError(
             "the file is empty; start from a shipped scenario, see 'posmas-fmi models'", str(path)
         )
+    problems = _design_problems(document.get("design"))
     try:
-        return _converter().structure(document, ScenarioFile), text
+        tables = _converter().structure(document, ScenarioFile)
     except (ClassValidationError, IterableValidationError) as error:
-        raise ScenarioError(tuple(_problems(error, "$")), str(path)) from None
+        problems = [*_problems(error, "$"), *problems]
+    if problems:
+        raise ScenarioError(tuple(problems), str(path))
+    return tables, text
+
+
+def _design_problems(table: Any) -> list[tuple[str, str]]:
+    """Unknown keys of ``[design]``, whose table is a class of the design floor."""
+    known = [a.name for a in attrs.fields(DesignSettings)]
+    keys = table if isinstance(table, dict) else {}
+    return [(f"$.design.{key}", _unknown(key, known)) for key in keys if key not in known]
 
 
 def _read_text(path: Path) -> str:
