@@ -152,6 +152,52 @@ def test_the_promised_stop_time_binds(file: FmuFile) -> None:
             instance.do_step(1.0, 0.1)
 
 
+def without(path: Path, to: Path, function: str) -> Path:
+    """A copy of an archive whose binary does not export a function."""
+    renamed = function.replace("fmi", "not", 1).encode()
+
+    def change(name: str, data: bytes) -> tuple[str, bytes]:
+        if name.startswith("binaries/"):
+            assert function.encode() in data
+            data = data.replace(function.encode() + b"\0", renamed + b"\0")
+        return name, data
+
+    return changed(path, to, change)
+
+
+def test_a_function_that_the_binary_lacks_is_missed_when_it_is_called(
+    path: Path, tmp_path: Path
+) -> None:
+    with FmuFile(path) as file:
+        name = f"fmi{file.version}GetFMU" + ("state" if file.version == 2 else "State")
+    with FmuFile(without(path, tmp_path / "poor.fmu", name)) as file:
+        instance = file.instantiate("agent")
+        instance.initialise()
+        instance.do_step(0.0, 0.1)
+        with pytest.raises(FmuError, match=f"has no function {name}"):
+            instance.get_state()
+
+
+def test_a_function_without_which_nothing_runs_is_missed_at_once(
+    path: Path, tmp_path: Path, temporary: Path
+) -> None:
+    with FmuFile(path) as file:
+        name = f"fmi{file.version}DoStep"
+    with pytest.raises(FmuError, match=f"has no function {name}"):
+        FmuFile(without(path, tmp_path / "useless.fmu", name))
+    assert not list(temporary.iterdir())
+
+
+def test_each_call_can_be_followed(path: Path) -> None:
+    calls: list[str] = []
+    with FmuFile(path, trace=calls.append) as file, file.instantiate("agent") as instance:
+        instance.initialise()
+        instance.do_step(0.0, 0.1)
+        assert calls[0] == "dlopen"
+        assert calls[-1] == f"fmi{file.version}DoStep"
+    assert calls[-1] == f"fmi{file.version}FreeInstance"
+
+
 # ---- models that fail ---------------------------------------------------------------------------
 
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.archive import unpack
+from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.variables import WHOLE, Ports, Variable, Variables
 
 _LOG = logging.getLogger(__name__)
@@ -55,6 +56,8 @@ class FmuFile:
         The .fmu file.
     messages : Messages, optional
         Where the messages of its instances go; kept by Python functions if left out.
+    trace : callable, optional
+        Called with the name before each call into the binary.
 
     Attributes
     ----------
@@ -85,8 +88,11 @@ class FmuFile:
 
     kind = "Co-Simulation"
 
-    def __init__(self, path: str | Path, messages: Messages | None = None) -> None:
+    def __init__(
+        self, path: str | Path, messages: Messages | None = None, trace: Trace | None = None
+    ) -> None:
         self.path = Path(path)
+        self._trace = trace
         folder = tempfile.TemporaryDirectory(prefix="posmas-fmi-", ignore_cleanup_errors=True)
         try:
             self._open(Path(folder.name))
@@ -97,7 +103,7 @@ class FmuFile:
         self._live: dict[int, _Live] = {}
         self._known_ports: dict[tuple[str, ...], Ports] = {}
         self._close = weakref.finalize(
-            self, _release, self._live, self._frees, self._fmu.freeLibrary, folder
+            self, _release, self._live, self._frees, self._fmu.close, folder
         )
 
     def _open(self, folder: Path) -> None:
@@ -135,6 +141,13 @@ class FmuFile:
 
         return FMU2Slave if self.version == 2 else FMU3Slave
 
+    def _needed(self) -> list[str]:
+        """Return the functions without which no run is possible."""
+        steps = ["EnterInitializationMode", "ExitInitializationMode", "DoStep", "FreeInstance"]
+        if self.version == 2:
+            return [f"fmi2{name}" for name in ("Instantiate", "SetupExperiment", *steps)]
+        return [f"fmi3{name}" for name in ("InstantiateCoSimulation", *steps)]
+
     def _load(self, identifier: str) -> None:
         import fmpy
 
@@ -150,17 +163,8 @@ class FmuFile:
             raise FmuError(
                 f"expected {name} among the binaries for {binaries} (the FMU has {has})", where
             )
-        binding = self._binding()
-        before = os.getcwd()
-        try:
-            self._fmu: Any = binding(
-                guid=self.token, modelIdentifier=identifier, unzipDirectory=str(self._folder)
-            )
-        except Exception as error:  # FMPy raises bare exceptions here
-            raise FmuError(f"the binary cannot be loaded: {error}", where) from error
-        finally:
-            os.chdir(before)  # FMPy leaves it changed when loading fails
-        self._functions: dict[str, Any] = self._fmu._functions
+        self._fmu = Binding(self.library, self._binding(), where, self._needed(), self._trace)
+        self._functions = self._fmu.functions
         resources = self._folder / "resources"
         place = resources.as_uri() if self.version == 2 else f"{resources}{os.sep}"
         self._resources = place.encode()

@@ -36,6 +36,13 @@ class ModelExchangeFile(FmuFile):
 
         return FMU2Model if self.version == 2 else FMU3Model
 
+    def _needed(self) -> list[str]:
+        kinds = {2: "Instantiate", 3: "InstantiateModelExchange"}
+        steps = ["SetTime", "SetContinuousStates", "EnterContinuousTimeMode", "FreeInstance"]
+        rates = {2: "GetDerivatives", 3: "GetContinuousStateDerivatives"}
+        names = (kinds[self.version], *steps, rates[self.version])
+        return [f"fmi{self.version}{name}" for name in names]
+
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
         text, token = name.encode(), self.token.encode()
         quiet = (False, False)  # neither visible nor debug logging
