@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from posmas_fmi.fmu.linearise import Linearisation
 
 DONE, NEGATIVE, CANCELLED = 0, 1, 130
+_SCENARIO = "a file, or the name of a shipped scenario"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -320,44 +321,59 @@ def _parser() -> argparse.ArgumentParser:
         return command
 
     run = add("run", _run, "design, certify, co-simulate, report")
-    run.add_argument("scenario", help="a file, or the name of a shipped scenario")
-    run.add_argument("--out", type=Path, help="output folder (default out/<name>)")
+    run.add_argument("scenario", help=_SCENARIO)
+    run.add_argument("--out", type=Path, metavar="DIR", help="output folder (default out/<name>)")
     run.add_argument("--until", type=_positive, metavar="S", help="end of the run [s]")
     run.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
     run.add_argument("--seed", type=int, metavar="N", help="of every random number")
     run.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     design = add("design", _design, "find gains and prove what they do")
-    design.add_argument("scenario")
-    design.add_argument("--method", choices=("contraction", "lmi", "paper-1", "paper-2"))
-    design.add_argument("--json", action="store_true")
+    design.add_argument("scenario", help=_SCENARIO)
+    design.add_argument(
+        "--method",
+        choices=("contraction", "lmi", "paper-1", "paper-2"),
+        help="in place of the scenario's",
+    )
+    design.add_argument("--json", action="store_true", help="print gains and certificate as JSON")
 
     certify = add("certify", _certify, "certificate for given gains")
-    certify.add_argument("scenario")
-    certify.add_argument("--gains", type=Path, required=True, metavar="FILE.json")
-    certify.add_argument("--json", action="store_true")
+    certify.add_argument("scenario", help=_SCENARIO)
+    certify.add_argument(
+        "--gains",
+        type=Path,
+        required=True,
+        metavar="FILE.json",
+        help='K and E, like {"K": [[..]], "E": [[..]]}; a design.json will do',
+    )
+    certify.add_argument("--json", action="store_true", help="print the certificate as JSON")
 
     report = add("report", _report, "write the report again from stored results")
-    report.add_argument("folder", type=Path, metavar="DIR")
+    report.add_argument("folder", type=Path, metavar="DIR", help="output folder of a run")
 
     add("models", _models, "list the shipped scenarios")
 
     fmu = add("fmu", _fmu_build, "build the shipped FMUs")
     actions = fmu.add_subparsers(required=True, metavar="ACTION")
-    build = actions.add_parser("build", help="(re)build the shipped FMUs")
+    text = "(re)build the shipped FMUs"
+    build = actions.add_parser("build", help=text, description=text)
     build.add_argument("names", nargs="*", metavar="NAME", help="default: all")
-    build.add_argument("--out", type=Path, default=Path("fmus"), help="folder (default fmus)")
+    build.add_argument(
+        "--out", type=Path, metavar="DIR", default=Path("fmus"), help="folder (default fmus)"
+    )
 
     regress = add("regress", _regress, "compare an FMU with a reference result")
-    regress.add_argument("fmu", type=Path)
-    regress.add_argument("reference", type=Path, metavar="REFERENCE.csv")
-    regress.add_argument("--json", action="store_true")
+    regress.add_argument("fmu", type=Path, metavar="FMU", help="the FMU to run")
+    regress.add_argument(
+        "reference", type=Path, metavar="REFERENCE.csv", help="time and the outputs to compare"
+    )
+    regress.add_argument("--json", action="store_true", help="print the deviations as JSON")
 
     paper = add("paper", _paper, "the ledger: printed, computed, verdict, proof")
-    paper.add_argument("--json", action="store_true")
+    paper.add_argument("--json", action="store_true", help="print the entries as JSON")
 
     linear = add("linearise", _linearise, "linear model of an FMU at an operating point")
-    linear.add_argument("fmu", type=Path, metavar="FMU")
+    linear.add_argument("fmu", type=Path, metavar="FMU", help="of Model Exchange or Co-Simulation")
     for option, dest, required, text in (
         ("--in", "inputs", True, "inputs"),
         ("--out", "outputs", True, "outputs: any real variables"),
@@ -383,7 +399,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         help="parameters, start values and inputs",
     )
-    linear.add_argument("--json", action="store_true")
+    linear.add_argument("--json", action="store_true", help="print the model as JSON")
 
     for name, text in (("check", "preflight of any FMU"),):
         later = add(name, _not_built(name), f"{text} (not in this version yet)")

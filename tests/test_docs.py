@@ -1,6 +1,11 @@
 """The documentation names what is there."""
 
+import os
 import re
+import runpy
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import attrs
@@ -8,6 +13,7 @@ import pytest
 
 import posmas_fmi
 from posmas_fmi import cli
+from posmas_fmi.design import design
 from posmas_fmi.scenario import tables
 
 ROOT = Path(posmas_fmi.__file__).resolve().parent.parent
@@ -70,6 +76,61 @@ def test_the_page_of_the_paper_has_every_entry_of_the_ledger():
 
 
 def test_links_of_the_documentation_lead_somewhere():
-    for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]:
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    for page in pages:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert link.startswith("http") or (page.parent / link).exists(), f"{page.name}: {link}"
+
+
+@pytest.fixture(scope="module")
+def generated():
+    return runpy.run_path(str(ROOT / "docs" / "generate.py"))
+
+
+@pytest.mark.parametrize("page", ["commands.md"])
+def test_pages_made_from_the_code_are_up_to_date(generated, page):
+    """If not: `python docs/generate.py`."""
+    assert generated["PAGES"][page]() == (ROOT / "docs" / page).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/tutorial.md"])
+def test_commands_of_the_guides_are_understood(page):
+    text = (ROOT / page).read_text(encoding="utf-8").split("## All commands")[0]
+    lines = re.findall(r"^(?:    )?(posmas-fmi (?!: )[a-z].*)$", text, re.M)
+    assert lines or page == "docs/index.md"
+    for line in lines:
+        cli._parser().parse_args(shlex.split(line.partition("#")[0])[1:])
+
+
+def test_the_scenario_of_the_tutorial_runs(tmp_path):
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    example = re.search(r"```toml\n(\[scenario\].*?)```", text, re.S).group(1)
+    path = tmp_path / "tanks.toml"
+    path.write_text(example, encoding="utf-8")
+    result = posmas_fmi.run(posmas_fmi.load(path), tmp_path / "out", report=False)
+    assert result.summary["verdict"] == "converged"
+    assert result.design.certificate.certified == "yes"
+    path.write_text(example.replace("period = 0.1 ", "period = 20.0 "), encoding="utf-8")
+    slow = posmas_fmi.load(path)
+    made = design(slow.agent, slow.network, slow.design, slow.clock.h)
+    assert 4.2 < result.design.certificate.rate < 4.3
+    assert 0.2 < made.certificate.rate < 0.23
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
+    site = tmp_path / "site"
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
+    made = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        fetched = re.findall(r'<(?:script|img|iframe)[^>]* src="(https?:[^"]*)"', text)
+        fetched += re.findall(
+            r'<link[^>]* rel="(?:stylesheet|preconnect)"[^>]*href="(https?:[^"]*)"', text
+        )
+        assert fetched == [], page.name
+    reference = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
+    for name in posmas_fmi.__all__:
+        assert re.search(rf'id="posmas_fmi\.[\w.]*\b{name}"', reference), name

@@ -203,10 +203,10 @@ def line_agent(
 ) -> Agent:
     """Return the line as an agent of model (1), for design and certificates.
 
-    x = [θp, θr, θs] [K] above the facility supply, y = [θr, θs], u the heat retained [W],
-    ``sec(u) = -(κ(y0 - gain·u) - κ0) θr`` written for the nominal θr; for the true θr(t) it is a
-    time-varying sector gain, and `sector` covers all of the range. Load and leakage are ``H g``,
-    with the load P0: a leader of this agent is the nominal line.
+    ``x = [θp, θr, θs]`` in kelvin above the facility supply, ``y = [θr, θs]``, u the heat
+    retained [W], ``sec(u) = -(κ(y0 - gain·u) - κ0) θr`` written for the nominal θr; for the true
+    θr(t) it is a time-varying sector gain, and `sector` covers all of the range. Load and leakage
+    are ``H g``, with the load P0: a leader of this agent is the nominal line.
 
     Parameters
     ----------
