@@ -36,7 +36,7 @@ from posmas_fmi.cosim.master import System
 from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.compile import find_compiler, host
-from posmas_fmi.fmu.instance import FmuFile
+from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from posmas_fmi.expression import VectorFunction
     from posmas_fmi.fmu.build import agent_fmu
     from posmas_fmi.fmu.compare import regress
-    from posmas_fmi.fmu.instance import FmuFile
+    from posmas_fmi.fmu.file import FmuFile
     from posmas_fmi.network import Network, network_from_arcs, read_adjacency
     from posmas_fmi.report import write_report
     from posmas_fmi.scenario import Scenario, load, run
@@ -38,7 +38,7 @@ _PLACES = {
     "Condition": "certify.certificate",
     "Design": "design",
     "DesignSettings": "design",
-    "FmuFile": "fmu.instance",
+    "FmuFile": "fmu.file",
     "Network": "network",
     "PosmasError": "errors",
     "Scenario": "scenario",

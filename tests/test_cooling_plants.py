@@ -16,7 +16,8 @@ import pytest
 from posmas_fmi.cooling import LineParameters, header_values, line_values
 from posmas_fmi.cooling.exchanger import conductance
 from posmas_fmi.fmu.build import fmu
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.fmu.sources import compiled, sources
 

@@ -21,7 +21,7 @@ from posmas_fmi.fmu import compile as compiling
 from posmas_fmi.fmu.build import archive, build_plants, build_shipped, cache_folder, file_name, fmu
 from posmas_fmi.fmu.compare import regress
 from posmas_fmi.fmu.compile import PLATFORMS, buildable, find_compiler, host
-from posmas_fmi.fmu.instance import FmuFile
+from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.fmu.positive_agent import positive_agent
 from posmas_fmi.fmu.sources import compiled, sources

@@ -15,7 +15,8 @@ from fmu_examples import example_1, named, tank_fmu, vector
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import agent_fmu
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from posmas_fmi.errors import FmuError
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 
 START = {"x": [1.0, 0.3]}
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 
 _BAND = re.compile(r"#\s*band:\s*height\s*=\s*(\S+?),?\s+width\s*=\s*(\S+)\s*$")
 

@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike
 
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance, FmuState
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
+from posmas_fmi.fmu.state import FmuState
 
 Interface = Literal["Model Exchange", "Co-Simulation"]
 Values = Mapping[str, ArrayLike]
@@ -388,7 +390,7 @@ def steps_vary(file: FmuFile) -> bool:
 
 def _says(file: FmuFile, fmi2: str, fmi3: str) -> bool:
     """Read a flag of the interface from the file: FMPy takes over some of FMI 3's only."""
-    root = ElementTree.parse(file._folder / "modelDescription.xml").getroot()
+    root = ElementTree.parse(file.folder / "modelDescription.xml").getroot()
     element = root.find(file.kind.replace(" ", "").replace("-", ""))
     flag = None if element is None else element.get(fmi2 if file.version == 2 else fmi3)
     return flag in ("true", "1")

@@ -25,7 +25,7 @@ from posmas_fmi.fmu.evaluation import (
     open_fmu,
     signals,
 )
-from posmas_fmi.fmu.instance import FmuFile
+from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.linearise import (
     Linearisation,
     MetzlerReport,

@@ -24,7 +24,7 @@ from posmas_fmi.fmu.evaluation import (
     signals,
     start_time,
 )
-from posmas_fmi.fmu.instance import FmuFile
+from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.model_exchange import ModelExchangeInstance
 
 if TYPE_CHECKING:

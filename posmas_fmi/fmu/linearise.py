@@ -29,7 +29,8 @@ from posmas_fmi.fmu.evaluation import (
     signals,
     steps_vary,
 )
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model_exchange import ModelExchangeInstance
 from posmas_fmi.fmu.step_response import Sampled, continuous, from_pulses, from_restarts
 

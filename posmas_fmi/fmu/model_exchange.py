@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.variables import pointer
 
 _MOST_ITERATIONS = 100  # of the discrete states at one event
 _MOST_EVENTS = 10_000  # on the way to one point in time
@@ -22,7 +24,7 @@ _EVENT_WIDTH = 1e-12  # relative: how closely a state event is located
 class ModelExchangeFile(FmuFile):
     """An FMU unpacked and loaded once, for any number of Model Exchange instances.
 
-    Parameters, attributes and errors are those of `posmas_fmi.fmu.instance.FmuFile`.
+    Parameters, attributes and errors are those of `posmas_fmi.fmu.file.FmuFile`.
     """
 
     kind = "Model Exchange"
@@ -181,7 +183,7 @@ class ModelExchangeInstance(FmuInstance):
                 "SetContinuousStates", f"expected {self.n_states} states (got {values.size})"
             )
         if values.size:
-            self._call("SetContinuousStates", _pointer(values), values.size)
+            self._call("SetContinuousStates", pointer(values), values.size)
 
     def states(self) -> Array:
         """Return the continuous states, (n_states,)."""
@@ -204,7 +206,7 @@ class ModelExchangeInstance(FmuInstance):
     def _vector(self, function: str, size: int) -> Array:
         values = np.full(size, np.nan)
         if size:
-            self._call(function, _pointer(values), size)
+            self._call(function, pointer(values), size)
         if not np.isfinite(values).all():
             k = int(np.flatnonzero(~np.isfinite(values))[0])
             raise self.error(function, f"value {k + 1} is not finite ({values[k]:g})")
@@ -300,7 +302,3 @@ class ModelExchangeInstance(FmuInstance):
 
 def _changed(before: Iterable[float], after: Iterable[float]) -> bool:
     return any((a > 0) != (b > 0) for a, b in zip(before, after, strict=True))
-
-
-def _pointer(values: Array) -> Any:
-    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))

@@ -16,7 +16,8 @@ from posmas_fmi.fmu.evaluation import (
     bring_to,
     saves_state,
 )
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
 
 _SAMPLES = 41  # of a pulse response
 _FEWEST = 9

@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.errors import FmuError
+from posmas_fmi.expression import Array
 from posmas_fmi.fmu.model import element_names
 
 REAL = frozenset({"Real", "Float64"})
@@ -175,3 +176,8 @@ class Variables:
                 places.append(start + index)
         references = (ctypes.c_uint * len(first))(*first)
         return Ports(tuple(resolved), references, size, np.array(places, dtype=np.intp))
+
+
+def pointer(values: Array) -> Any:
+    """Return values as the FMI functions take them; the array must outlive the call."""
+    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
