@@ -32,6 +32,7 @@ from posmas_fmi.cosim import engine, native
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System
 from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.fmu.build import agent_fmu, fmu
@@ -78,7 +79,7 @@ class Setting:
         return System(
             self.agent,
             network,
-            make_protocol(network, K, E, phi=0.3),
+            ProtocolLaw(self.agent, make_protocol(network, K, E, phi=0.3)),
             Channel.uniform(network.adjacency.nnz + 1, H),
             Clock.of(self.steps * H, H),
             np.zeros((self.n, 2)),
@@ -91,7 +92,7 @@ class Setting:
         given = {} if path else {"A": agent.A, "H": agent.H, "B": agent.B, "C": agent.C}
         specs = [PlantSpec(path or self.fmu, {**given, "x": x}) for x in x0]
         ports = [PortMap.plain([f"{v}[{k + 1}]" for k in range(c)]) for v, c in PORTS]
-        return FmuPlant(self.network.names, specs, *ports, stop=math.inf)
+        return FmuPlant.of_agents(self.network.names, specs, *ports, stop=math.inf)
 
 
 PORTS = (("u", 1), ("y", 2), ("x", 2))
@@ -153,7 +154,8 @@ def floor(setting: Setting, library: ctypes.CDLL, inputs: np.ndarray) -> float:
 
 
 def engine_run(setting: Setting, record: bool = False, which: engine.Wanted = "c") -> float:
-    choice, system = engine.choose(setting.agent, which), setting.system()
+    system = setting.system()
+    choice = engine.choose(system.law, which)
     with setting.plant() as plant:
         if which == "numpy":
             return per_step(setting, lambda: engine.run(system, plant, choice=choice))
@@ -190,7 +192,7 @@ def fmpy_loop(setting: Setting, controlled: bool = False) -> float:
 
     system, agent = setting.system(), setting.agent
     estimates, heard = system.xhat0.copy(), system.network.adjacency.indptr
-    observe, weights = Propagator.of(agent, H), system.protocol
+    observe, weights = Propagator.of(agent, H), system.law.protocol
     senders = system.senders
 
     def control(t: float, i: int, y: np.ndarray) -> list[float]:
@@ -335,7 +337,7 @@ def threads(repeat: int) -> None:
     )
     path = fmu(FmuModel("slow", "", variables, {"model.c": SLOW_C}, Experiment()))
     setting = Setting.of(100, 200)
-    choice = engine.choose(setting.agent, "c")
+    choice = engine.choose(setting.system().law, "c")
     wall: dict[int, float] = {}
     for _ in range(repeat):
         for count in (1, 2):

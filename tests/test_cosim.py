@@ -11,6 +11,7 @@ from posmas_fmi.agent import linear_agent
 from posmas_fmi.cosim.channel import Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.continuous import continuous
+from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System, simulate
 from posmas_fmi.cosim.plant import CallablePlant, ModelPlant
 from posmas_fmi.cosim.propagator import Propagator
@@ -21,8 +22,9 @@ from posmas_fmi.protocol import make_protocol
 
 def system(agent, network, protocol, clock, xhat0, s0, **channel):
     arcs = network.adjacency.nnz + len(network.pinned)
+    law = ProtocolLaw(agent, protocol)
     return System(
-        agent, network, protocol, Channel.uniform(arcs, clock.h, **channel), clock, xhat0, s0, 1
+        agent, network, law, Channel.uniform(arcs, clock.h, **channel), clock, xhat0, s0, 1
     )
 
 
@@ -198,7 +200,7 @@ def test_bad_channels_are_refused():
 def test_order_of_calls_is_read_then_step():
     agent, network = linear_agent([[-1.0]], [[1.0]], [[1.0]]), network_from_arcs(1, [], [1])
     protocol = make_protocol(network, [[-1.0]], [[0.5]], 1.0)
-    plant = CallablePlant(lambda x: x, lambda k, t, h, x, U: x + h * U, np.array([[2.0]]))
+    plant = CallablePlant(lambda x: x, lambda t, h, x, U: x + h * U, np.array([[2.0]]))
     rows = []
     definition = system(agent, network, protocol, Clock.of(0.3, 0.1), np.zeros((1, 1)), np.ones(1))
     outcome = simulate(definition, plant, lambda t, row: rows.append((t, row)))
@@ -220,7 +222,7 @@ def test_the_sampled_loop_tends_to_the_continuous_protocol(observer):
         oracle = continuous(
             definition.agent,
             definition.network,
-            definition.protocol,
+            definition.law.protocol,
             x0,
             definition.xhat0,
             definition.s0,
@@ -270,8 +272,8 @@ def test_delay_and_loss_do_not_keep_the_agents_from_a_leader_at_rest(channel):
 def test_a_failing_plant_ends_the_run_and_keeps_what_was_recorded():
     definition, x0 = example_1(0.01)
 
-    def advance(k, t, h, x, U):
-        if k == 7:
+    def advance(t, h, x, U):
+        if round(t / h) == 7:
             raise FmuCallError("doStep returned Error", "plant.fmu, doStep", "3", t)
         return x
 
@@ -298,9 +300,9 @@ def test_an_interrupt_ends_the_run_as_cancelled():
 def test_values_that_run_away_end_the_run_as_diverged(value):
     definition, x0 = example_1(0.01)
 
-    def advance(k, t, h, x, U):
+    def advance(t, h, x, U):
         x = x.copy()
-        x[2] = value if k == 3 else x[2]
+        x[2] = value if round(t / h) == 3 else x[2]
         return x
 
     def output(x):

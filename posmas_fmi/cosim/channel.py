@@ -24,11 +24,14 @@ class Channel:
         Largest additional delay, drawn for each message alike likely.
     loss : (arcs,) array
         Probability that a message does not arrive.
+    resolution : float
+        Messages are rounded to multiples of it; 0: they are not.
     """
 
     delay: np.ndarray[tuple[int], np.dtype[np.int64]]
     jitter: np.ndarray[tuple[int], np.dtype[np.int64]]
     loss: Array
+    resolution: float = 0.0
 
     @classmethod
     def uniform(
@@ -93,7 +96,7 @@ class Mailbox:
     def __attrs_post_init__(self) -> None:
         self.stamp = np.full(len(self.held), -1)
 
-    def exchange(self, k: int, message: Array) -> Array:
+    def exchange(self, k: int, message: Array, loss: Array | None = None) -> Array:
         """Send one message over each arc at step k and return what every arc now holds.
 
         Parameters
@@ -101,17 +104,21 @@ class Mailbox:
         k : int
             Communication step.
         message : (arcs, width) array
+        loss : (arcs,) array, optional
+            Probability of loss now; default that of the channel.
 
         Returns
         -------
         (arcs, width) array
         """
         self.sent += len(message)
-        if self.channel.ideal:
+        if self.channel.ideal and loss is None:
             self.held = message
+            self.stamp[:] = k
             return message
+        loss = self.channel.loss if loss is None else loss
         arcs = np.arange(len(message))
-        arrives = self.random.random(len(message)) >= self.channel.loss
+        arrives = self.random.random(len(message)) >= loss
         extra = self.random.integers(0, self.channel.jitter + 1)
         due = k + self.channel.delay + extra
         self.lost += int((~arrives).sum())
@@ -126,6 +133,10 @@ class Mailbox:
             self.stamp[chosen[newer]] = sent_at
         self.held = held
         return held
+
+    def age(self, k: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """How many steps ago what each arc holds was sent, (arcs,)."""
+        return k - np.maximum(self.stamp, 0)
 
 
 @attrs.define(eq=False)
@@ -155,24 +166,29 @@ class Arrivals:
         self._stamp = np.full(len(self.channel.delay), -1)
         self.lost = np.zeros(0, dtype=np.int64)
 
-    def draw(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
+    def draw(
+        self, begin: int, end: int, loss: Array | None = None
+    ) -> np.ndarray[tuple[int, int], np.dtype[np.int32]]:
         """Return the age of the message taken at each step and arc, -1 where none is.
 
         Parameters
         ----------
         begin, end : int
             Steps, end not included; begin where the last draw ended.
+        loss : (arcs,) array, optional
+            Probability of loss in these steps; default that of the channel.
 
         Returns
         -------
         (end - begin, arcs) array of int
         """
         arcs = len(self._stamp)
+        loss = self.channel.loss if loss is None else loss
         ages = np.full((end - begin, arcs), -1, dtype=np.int32)
         self.lost = np.zeros(end - begin, dtype=np.int64)
         for row, k in enumerate(range(begin, end)):
             # the same two draws as in Mailbox.exchange
-            arrives = self.random.random(arcs) >= self.channel.loss
+            arrives = self.random.random(arcs) >= loss
             due = k + self.channel.delay + self.random.integers(0, self.channel.jitter + 1)
             self.lost[row] = arcs - int(arrives.sum())
             for when in np.unique(due[arrives]):

@@ -12,13 +12,16 @@ from typing import Any, Literal
 import attrs
 import numpy as np
 
-from posmas_fmi.agent import Agent
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.channel import Arrivals
+from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
+from posmas_fmi.cosim.fmus import Incident as CIncident
 from posmas_fmi.cosim.fmus import Report
+from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
 from posmas_fmi.cosim.master import (
     DIVERGED,
+    Incident,
     Outcome,
     Progress,
     Record,
@@ -28,9 +31,8 @@ from posmas_fmi.cosim.master import (
     simulate,
 )
 from posmas_fmi.cosim.plant import Plant
-from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.errors import BuildError, InputError
-from posmas_fmi.expression import Array, VectorFunction
+from posmas_fmi.expression import Array
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ RecordBlock = Callable[[Array, dict[str, Array]], None]  # times (r,), arrays (r
 
 SLICE = 0.05  # s of wall time between returns to Python: how long Ctrl-C may take
 BLOCK = 4_000_000  # bytes of rows that are kept until the slice ends
-VARIABLES = ("x", "xhat", "u", "sec_u", "y", "s")
+VARIABLES = ("x", "xhat", "u", "sec_u", "y", "s", "measured", "extra")
 
 
 @attrs.frozen
@@ -67,40 +69,49 @@ class Choice:
         return facts | ({"reason": self.reason} if self.reason else {})
 
 
-def choose(agent: Agent, wanted: Wanted = "auto") -> Choice:
-    """Choose the loop for a system of these agents, and have the engine compiled.
+def choose(law: Law, wanted: Wanted = "auto", unfit: str = "") -> Choice:
+    """Choose the loop for a system with these controllers, and have the engine compiled.
 
     Parameters
     ----------
-    agent : Agent
+    law : Law
     wanted : {"auto", "c", "numpy"}
         Auto: the engine where it can be used.
+    unfit : str, optional
+        Why the system needs the numpy loop, whatever its controllers.
 
     Raises
     ------
     InputError
-        If the engine is wanted but g or sec are no expressions.
+        If the engine is wanted but g, sec or the controllers are Python functions.
     BuildError
         If the engine is wanted but cannot be compiled.
 
     Examples
     --------
     >>> from posmas_fmi.agent import linear_agent
-    >>> choose(linear_agent([[-1.0]], [[1.0]], [[1.0]]), "numpy").engine
+    >>> from posmas_fmi.cosim.law import ProtocolLaw
+    >>> from posmas_fmi.network import network_from_arcs
+    >>> from posmas_fmi.protocol import make_protocol
+    >>> protocol = make_protocol(network_from_arcs(1, [], [1]), [[-1.0]], [[0.5]], 1.0)
+    >>> choose(ProtocolLaw(linear_agent([[-1.0]], [[1.0]], [[1.0]]), protocol), "numpy").engine
     'numpy'
     """
     if wanted == "numpy":
         return Choice("numpy", "chosen in the scenario")
-    g, sec = agent.g, agent.sec
-    if not isinstance(g, VectorFunction) or not isinstance(sec, VectorFunction):
-        reason = "g and sec are Python functions; the engine needs expressions"
-        if wanted == "c":
-            raise InputError(reason, "$.scenario.engine")
-        return _fall_back(reason)
+    reason = unfit
+    if not reason and not isinstance(law, CompiledLaw):
+        reason = "the controllers are Python functions; the engine needs them in C"
     try:
-        sources = native.engine_sources(g, sec, agent.m, agent.p, agent.q)
-        path = native.library(sources)
+        if reason:
+            raise InputError(reason, "$.scenario.engine")
+        assert isinstance(law, CompiledLaw)
+        path = native.library(law.sources())
         native.load(path)
+    except InputError as error:
+        if wanted == "c":
+            raise
+        return _fall_back(error.message)
     except BuildError as error:
         if wanted == "c":
             raise
@@ -145,7 +156,7 @@ def run(
     -------
     Outcome
     """
-    choice = choice or choose(system.agent)
+    choice = choice or choose(system.law, unfit=unfit(system))
     if choice.engine == "c" and not isinstance(plant, FmuPlant):
         choice = _fall_back(f"the engine steps FMUs (the plant is a {type(plant).__name__})")
     if choice.engine == "numpy":
@@ -156,6 +167,13 @@ def run(
     return Engine(system, plant, library, threads, variables if record else ()).run(
         record, progress
     )
+
+
+def unfit(system: System) -> str:
+    """Return why the engine cannot run a system; empty if it can."""
+    if len(system.stages) > 1 or system.iteration is not None:
+        return "the engine steps all FMUs at once; other ways of coupling run with numpy"
+    return ""
 
 
 def _by_row(record: RecordBlock | None, variables: tuple[str, ...]) -> Record | None:
@@ -178,7 +196,11 @@ class _Engine(ctypes.Structure):
 
     _fields_ = (
         ("fmus", _pointer),
+        ("agents", _int),
+        ("controllers", _pointer),
         ("controller", _pointer),
+        ("every", _pointer),
+        ("own_values", _pointer),
         ("steps", _int),
         ("period", _int),
         ("shows_states", _int),
@@ -193,13 +215,37 @@ class _Engine(ctypes.Structure):
         ("own_innovation", _pointer),
         ("delay", _pointer),
         ("slots", _int),
+        ("resolution", _double),
+        ("first_extra", _pointer),
+        ("first_term", _pointer),
+        ("term", _pointer),
+        ("term_weight", _pointer),
+        ("extra_bias", _pointer),
+        ("drives", _int),
+        ("measured_from", _pointer),
+        ("recorded", _pointer),
+        ("extra_columns", _int),
+        ("sensor_gain", _pointer),
+        ("sensor_offset", _pointer),
+        ("sensor_resolution", _pointer),
+        ("actuator_gain", _pointer),
+        ("frozen", _pointer),
+        ("freezes", _int),
+        ("incident", _pointer),
         ("k", _int),
         ("ready", _int),
         ("diverging", _int),
-        ("xhat", _pointer),
-        ("innovation", _pointer),
+        ("memory", _pointer),
+        ("pending", _pointer),
+        ("message", _pointer),
         ("readings", _pointer),
+        ("measured", _pointer),
+        ("u", _pointer),
+        ("applied", _pointer),
+        ("actuated", _pointer),
+        ("inputs", _pointer),
         ("held", _pointer),
+        ("sent_at", _pointer),
         ("min_state", _pointer),
         ("min_time", _pointer),
         ("limit", _double),
@@ -208,13 +254,17 @@ class _Engine(ctypes.Structure):
         ("scratch", _pointer),
         ("reports", _pointer),
         ("arrivals", _pointer),
+        ("drive", _pointer),
+        ("noise", _pointer),
         ("time", _pointer),
-        ("x", _pointer),
+        ("x_rows", _pointer),
         ("xhat_rows", _pointer),
-        ("u", _pointer),
-        ("sec_u", _pointer),
-        ("y", _pointer),
-        ("s", _pointer),
+        ("u_rows", _pointer),
+        ("applied_rows", _pointer),
+        ("y_rows", _pointer),
+        ("s_rows", _pointer),
+        ("measured_rows", _pointer),
+        ("extra_rows", _pointer),
         ("rows", _int),
         ("halt", _int),
         ("ended", _int),
@@ -242,7 +292,8 @@ class Engine:
         threads: int,
         variables: tuple[str, ...],
     ) -> None:
-        self._system, self._plant = system, plant
+        assert isinstance(system.law, CompiledLaw)
+        self._system, self._plant, self._law = system, plant, system.law
         self._run = library.engine_run
         self._run.argtypes, self._run.restype = [_pointer], None
         self._keep: dict[str, Any] = {}  # what the structure points to
@@ -250,8 +301,11 @@ class Engine:
         if library.engine_size() != ctypes.sizeof(_Engine):
             raise BuildError("the engine's library does not belong to this version")
         self._observed = -1  # the last communication point that was recorded
-        self._pending = False
+        self._pending = self._halted = False
         self._sent = self._lost = 0
+        self._conditions = system.timeline.at(0)
+        self._incidents: Any = None
+        self._happened: list[Incident] = []
         self._largest_initial = 0.0
         self._threads = max(1, min(threads, system.network.N, int(library.engine_threads())))
         self._define(library)
@@ -268,42 +322,96 @@ class Engine:
 
     def _define(self, library: ctypes.CDLL) -> None:
         system, e = self._system, self._e
-        network, protocol, channel = system.network, system.protocol, system.channel
-        arcs, pinned = network.adjacency.nnz, network.pinned
-        constants = self._point("controller", _constants(system))
-        if library.engine_controller_size() != constants.nbytes:
-            raise BuildError("the engine's library was made for an agent of other sizes")
-        e.fmus = self._plant.fmus.address
+        network, law, N = system.network, self._law, system.network.N
+        every, period_of = np.unique(system.every, return_inverse=True)
+        tick = system.clock.period / TICKS_PER_SECOND
+        constants = [law.constants(int(steps) * tick) for steps in every]
+        if library.engine_controller_size() != constants[0].nbytes:
+            raise BuildError("the engine's library was made for controllers of other sizes")
+        self._point("controllers", np.concatenate(constants))
+        self._point("controller", period_of[:N], np.int64)
+        self._point("every", system.every, np.int64)
+        self._point("own_values", law.own_values)
+        e.fmus, e.agents = self._plant.fmus.address, N
         e.steps, e.period = system.clock.steps, system.clock.period
         e.shows_states = self._plant.shows_states
-        e.all_arcs = arcs + len(pinned)
+        e.all_arcs = network.adjacency.nnz + len(network.pinned)
+        e.resolution = system.channel.resolution
         self._point("first_arc", network.adjacency.indptr, np.int64)
         self._point("sender", system.senders, np.int64)
+        leader_arc = np.full(N, -1)
+        leader_arc[list(network.pinned)] = network.adjacency.nnz + np.arange(len(network.pinned))
+        self._point("leader_arc", leader_arc, np.int64)
+        self._set_weights(law.weights)
+        e.slots = system.channel.longest + 2
+        self._arrivals = None
+        self._draws_loss = system.timeline.has("loss")
+        if system.channel.jitter.any() or system.channel.loss.any() or self._draws_loss:
+            self._arrivals = Arrivals(system.channel, np.random.default_rng(system.seed))
+        elif system.channel.delay.any():
+            self._point("delay", system.channel.delay, np.int64)
+        self._define_wiring()
+
+    def _define_wiring(self) -> None:
+        system, e, wiring = self._system, self._e, self._system.wiring
+        self._point("first_extra", wiring.first_extra, np.int64)
+        self._point("first_term", wiring.first_term, np.int64)
+        self._point("term", wiring.sources, np.int64)
+        self._point("term_weight", wiring.weights)
+        self._point("extra_bias", wiring.bias)
+        self._point("measured_from", wiring.measured, np.int64)
+        self._point("recorded", wiring.recorded, np.int64)
+        e.extra_columns = len(wiring.recorded)
+        e.drives = wiring.drive.columns
+        sensors, timeline = system.sensors, system.timeline
+        if sensors is not None or timeline.has("sensor_gain", "sensor_offset"):
+            shape = (system.network.N, system.measured)
+            resolution = np.zeros(shape) if sensors is None else sensors.resolution
+            self._point("sensor_resolution", resolution)
+        self._noise = sensors if sensors is not None and sensors.noise.any() else None
+
+    def _set_weights(self, weights: Weights) -> None:
+        """Set how messages count, for the digraph as it now is."""
+        network = self._system.network
         receiver = np.repeat(np.arange(network.N), np.diff(network.adjacency.indptr))
-        self._point("weight", _by_arc(protocol.heard, receiver))
-        innovation_weight = _by_arc(protocol.heard_innovation, receiver)
+        self._point("weight", _by_arc(weights.heard, receiver))
+        innovation_weight = _by_arc(weights.heard_innovation, receiver)
         if innovation_weight.any():
             self._point("innovation_weight", innovation_weight)
-        leader_arc = np.full(network.N, -1)
-        leader_arc[list(pinned)] = arcs + np.arange(len(pinned))
-        self._point("leader_arc", leader_arc, np.int64)
+        else:
+            self._e.innovation_weight = None
         for name in ("own", "leader", "own_innovation"):
-            self._point(name, getattr(protocol, name))
-        e.slots = channel.longest + 2
-        self._arrivals = None
-        if channel.jitter.any() or channel.loss.any():
-            self._arrivals = Arrivals(channel, np.random.default_rng(system.seed))
-        elif channel.delay.any():
-            self._point("delay", channel.delay, np.int64)
+            self._point(name, getattr(weights, name))
+
+    def _set_conditions(self, k: int) -> None:
+        """Set what holds from communication point k on."""
+        conditions = self._conditions = self._system.timeline.at(k)
+        if "sensor_resolution" in self._keep:
+            self._point("sensor_gain", conditions.sensor_gain)
+            self._point("sensor_offset", conditions.sensor_offset)
+        if self._system.timeline.has("actuator_gain"):
+            self._point("actuator_gain", conditions.actuator_gain)
+        if self._system.timeline.has("arc_off"):
+            self._set_weights(self._system.weights_with(conditions.arc_off))
+        jump = self._system.leader_at(k)
+        if jump is not None:
+            self._memory[k % 2, -1] = self._law.lead(jump)
 
     def _allocate(self) -> None:
-        system, e = self._system, self._e
-        n, m, q = system.network.N, system.agent.m, system.agent.q
-        self._xhat = self._point("xhat", np.zeros((e.slots, n + 1, m)))
-        self._xhat[0, :n], self._xhat[0, n] = system.xhat0, system.s0
-        self._innovation = self._point("innovation", np.zeros((e.slots, n + 1, q)))
-        width = q + (m if self._plant.shows_states else 0)
-        self._readings = self._point("readings", np.zeros((2, n, width)))
+        system, e, fmus, law = self._system, self._e, self._plant.fmus, self._law
+        n, p = system.network.N, system.agent.p
+        memory, leader = law.start(system.xhat0), law.lead(system.s0)
+        self._memory = self._point("memory", np.zeros((2, n + 1, memory.shape[1])))
+        self._memory[0, :n], self._memory[0, n] = memory, leader
+        self._point("pending", memory)
+        width = len(law.leader_message(leader))
+        self._message = self._point("message", np.zeros((e.slots, n + 1, width)))
+        self._readings = self._point("readings", np.zeros((2, int(fmus.reading_at[-1]))))
+        self._point("measured", np.zeros((2, n, system.measured)))
+        for name in ("u", "applied", "actuated"):
+            self._point(name, np.zeros((n, p)))
+        self._point("inputs", np.zeros(int(fmus.input_at[-1])))
+        self._frozen = self._point("frozen", np.zeros(len(fmus)), np.int64)
         self._min_state = self._point("min_state", np.full(n, np.inf))
         self._min_time = self._point("min_time", np.zeros(n))
         e.limit = np.inf
@@ -314,6 +422,12 @@ class Engine:
         self._point("scratch", np.zeros((threads, self._plant.fmus.room)))
         self._reports = (Report * threads)()
         self._e.reports = ctypes.addressof(self._reports)
+
+    def freeze_failures(self) -> None:
+        """Let the run go on without instances that fail: neighbours keep their last messages."""
+        self._incidents = (CIncident * len(self._plant.fmus))()
+        self._e.incident = ctypes.addressof(self._incidents)
+        self._e.freezes = 1
 
     def _make_rows(self, variables: tuple[str, ...]) -> None:
         """Make the buffers of a slice; touched, so that the first slice is as fast as others."""
@@ -326,24 +440,29 @@ class Engine:
             "sec_u": (n, agent.p),
             "y": (n, agent.q),
             "s": (agent.m,),
+            "measured": (n, system.measured),
+            "extra": (self._e.extra_columns,),
         }
         wanted = {name: shape for name, shape in shapes.items() if name in variables}
         if not self._plant.shows_states:
             wanted.pop("x", None)
         row = 8 * sum(int(np.prod(shape)) for shape in wanted.values()) + 8
-        arrivals = 0 if self._arrivals is None else 4 * self._e.all_arcs
-        self._room = int(max(1, min(BLOCK // (row + arrivals), system.clock.steps + 1)))
+        other = 0 if self._arrivals is None else 4 * self._e.all_arcs
+        other += 8 * self._e.drives
+        other += 0 if self._noise is None else 8 * n * system.measured
+        self._room = int(max(1, min(BLOCK // (row + other), system.clock.steps + 1)))
         self._rows: dict[str, Array] = {}
         if wanted:
             self._time = self._point("time", np.full(self._room, 0.0))
         for name, shape in wanted.items():
-            member = "xhat_rows" if name == "xhat" else name
+            member = "applied_rows" if name == "sec_u" else f"{name}_rows"
             self._rows[name] = self._point(member, np.full((self._room, *shape), 0.0))
 
     # ---- the run --------------------------------------------------------------------------------
 
     def halt(self) -> None:
         """Stop at the next communication point; may be called from any thread."""
+        self._halted = True
         self._e.halt = 1
 
     def run(self, record: RecordBlock | None, progress: Progress | None) -> Outcome:
@@ -358,41 +477,57 @@ class Engine:
             self._take(record)
         time_now = self._system.clock.time(self._e.k)
         if self._e.ended == _FAILED:
-            error = self._plant.fmus.error(self._reports[0], time_now)
+            error = self._plant.fmus.error(self._reports[0].failure, time_now)
             ended, reason, agent = "failed", str(error), error.agent
         elif self._e.ended == _DIVERGED:
             agent, reason = self._diverged()
             ended = "diverged"
-        elif self._e.halt:
+        elif self._halted:
             ended, reason = "cancelled", "halted"
         self._plant.stepped_to(time_now)
         return self._outcome(ended, reason, agent)
 
     def _begin(self) -> None:
         """Read the FMUs at the start, from which the limit of divergence follows."""
+        self._set_conditions(0)
+        self._feed(0, 0)
         self._e.until = 0
         self._call()
         if self._e.ended != _GOES_ON:
             return
-        n, system = self._system.network.N, self._system
+        n, m, system = self._system.network.N, self._system.agent.m, self._system
         truth = self._truth(0)
-        xhat, s = self._xhat[0, :n], self._xhat[0, n]
+        xhat, s = self._memory[0, :n, :m], self._memory[0, n, :m]
         scale = max(np.abs(truth).max(), np.abs(s).max(), np.abs(xhat).max(), 1.0)
         self._e.limit = DIVERGED * float(scale)
         self._largest_initial = float(np.abs(truth - s).max())
         if self._arrivals is not None:
-            message = np.concatenate([self._xhat[0], self._innovation[0]], axis=1)
             senders = np.concatenate([system.senders, np.full(len(system.network.pinned), n)])
-            self._point("held", message[senders])
+            self._point("held", self._message[0, senders])
+            self._point("sent_at", np.zeros(len(senders)), np.int64)
+
+    def _feed(self, begin: int, end: int) -> None:
+        """Provide what a slice needs from outside: signals, noise, arrivals."""
+        e = self._e
+        if e.drives:
+            self._point("drive", self._system.wiring.drive.rows(begin, end + 1))
+        if self._noise is not None:
+            self._point("noise", self._noise.noise_at(begin, end + 1, self._system.seed))
+        if self._arrivals is not None and end > begin:
+            loss = self._conditions.loss if self._draws_loss else None
+            self._point("arrivals", self._arrivals.draw(begin, end, loss), np.int32)
 
     def _slices(self, record: RecordBlock | None, progress: Progress | None) -> None:
         e, clock = self._e, self._system.clock
-        length = 1
-        while e.ended == _GOES_ON and not e.halt:
-            room = min(length, self._room) if self._rows or self._arrivals else length
-            e.until = min(e.k + room, clock.steps + 1)
-            if self._arrivals is not None:
-                self._point("arrivals", self._arrivals.draw(e.k, e.until), np.int32)
+        length, change = 1, self._system.next_change(0)
+        while e.ended == _GOES_ON and not self._halted:
+            if e.k == change:
+                self._set_conditions(e.k)
+                e.ready, change = 2, self._system.next_change(e.k)
+            bounded = self._rows or self._arrivals or e.drives or self._noise
+            room = min(length, self._room) if bounded else length
+            e.until = min(e.k + room, clock.steps + 1, change)
+            self._feed(e.k, e.until)
             began = time.perf_counter()
             self._call()
             took = time.perf_counter() - began
@@ -408,7 +543,22 @@ class Engine:
             log.warning("the system gives no %d threads; going on with one", self._e.threads)
             self._use_threads(1)
             self._run(ctypes.addressof(self._e))
-        self._plant.fmus.warn(self._reports[0], self._system.clock.time(self._e.k))
+        time_now = self._system.clock.time(self._e.k)
+        self._plant.fmus.warn(self._reports[0], time_now)
+        if self._incidents is not None and self._e.ended == _GOES_ON:
+            self._note_incidents(time_now)
+
+    def _note_incidents(self, time_now: float) -> None:
+        """Take down which instances have failed in the last step of the slice."""
+        assert self._incidents is not None
+        for number, incident in enumerate(self._incidents):
+            if incident.call:
+                error = self._plant.fmus.error(incident, time_now)
+                name = self._plant.names[number]
+                self._happened.append(Incident(name, time_now, str(error), "frozen"))
+                log.warning("%s; it is frozen", error)
+                incident.call = 0
+        self._e.halt = int(self._halted)
 
     def _take(self, record: RecordBlock | None) -> None:
         """Hand over the rows of the last slice and count its messages, once."""
@@ -427,22 +577,24 @@ class Engine:
 
     def _truth(self, k: int) -> Array:
         """States at point k as far as they are known: the estimates where the FMU shows none."""
+        n, agent = self._system.network.N, self._system.agent
         if self._plant.shows_states:
-            return np.asarray(self._readings[k % 2, :, self._system.agent.q :])
-        return np.asarray(self._xhat[k % self._e.slots, :-1])
+            first = self._plant.fmus.reading_at[:n, None] + agent.q
+            return np.asarray(self._readings[k % 2, first + np.arange(agent.m)])
+        return np.asarray(self._memory[k % 2, :n, : agent.m])
 
     def _diverged(self) -> tuple[str, str]:
-        k = self._e.k
-        xhat = self._xhat[k % self._e.slots, :-1]
+        k, m = self._e.k, self._system.agent.m
+        xhat = self._memory[k % 2, :-1, :m]
         size = np.maximum(np.abs(self._truth(k)).max(axis=1), np.abs(xhat).max(axis=1))
         names = self._system.network.names
         return diverged_reason(names, size, self._e.limit, self._system.clock.time(k))
 
     def _outcome(self, ended: Any, reason: str, agent: str) -> Outcome:
-        n, k = self._system.network.N, self._observed
+        n, m, k = self._system.network.N, self._system.agent.m, self._observed
         tracking = estimation = np.zeros(n)
         if k >= 0:
-            here = self._xhat[k % self._e.slots]
+            here = self._memory[k % 2, :, :m]
             tracking, estimation = errors_at(self._truth(k), here[:n], here[n])
         return Outcome(
             ended=ended,
@@ -457,19 +609,8 @@ class Engine:
             lost=self._lost,
             reason=reason,
             failed_agent=agent,
+            incidents=tuple(self._happened),
         )
-
-
-def _constants(system: System) -> Array:
-    """Return the members of csrc/controller.h's structure, one after the other."""
-    agent, protocol = system.agent, system.protocol
-    step = Propagator.of(agent, system.clock.h)
-    matrices = (
-        *(protocol.K, protocol.E, agent.B, agent.C, agent.H),
-        *(step.full, step.half, step.gamma, step.half_gamma),
-        *(step.start, step.middle, step.end),
-    )
-    return np.concatenate([[step.h], *(matrix.ravel() for matrix in matrices)])
 
 
 def _by_arc(weights: Any, receiver: Any) -> Array:

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import native
-from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap
+from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap, Whole
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
@@ -23,35 +23,52 @@ log = logging.getLogger(__name__)
 __all__ = ["FmuPlant", "PlantSpec", "PortMap"]
 
 
-@attrs.frozen
+@attrs.frozen(eq=False)
 class PlantSpec:
-    """One agent's plant.
+    """One instance: an agent's plant, or an FMU that is no agent.
 
     Attributes
     ----------
     fmu : Path
     values : mapping
         Start values and parameters by name.
+    name : str
+        Of the agent or component, in errors and messages.
+    inputs : PortMap
+        What is set before each step: u of an agent, then what is wired.
+    readings : PortMap
+        What is read after it: y of an agent, its x where shown, then what else is used.
+    tolerance : float, optional
+        Relative, for the solver inside the FMU; its own default if left out.
     """
 
     fmu: Path
-    values: Mapping[str, Any] = attrs.field(factory=dict, eq=False)
+    values: Mapping[str, Any] = attrs.field(factory=dict)
+    name: str = ""
+    inputs: PortMap = attrs.field(default=PortMap.plain(()))
+    readings: PortMap = attrs.field(default=PortMap.plain(()))
+    tolerance: float | None = None
 
 
 class FmuPlant:
-    """All agents' FMUs: one file loaded once, one instance per agent.
+    """FMU instances: those of the agents first, each file loaded once.
 
     Parameters
     ----------
-    agents : sequence of str
-        Names.
     specs : sequence of PlantSpec
-        One per agent.
-    inputs, outputs : PortMap
-    states : PortMap, optional
-        Where the FMU shows x.
+        One per instance.
+    shows_states : bool
+        Whether the readings of agents contain x.
     stop : float
         End of the run [s].
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the instances.
+    fmus : Fmus
+    input_at, reading_at : (instances + 1,) array of int
+        Where inputs and readings of each instance begin.
 
     Raises
     ------
@@ -61,82 +78,102 @@ class FmuPlant:
         If an FMU cannot be loaded or initialised.
     """
 
-    def __init__(
-        self,
-        agents: Sequence[str],
-        specs: Sequence[PlantSpec],
-        inputs: PortMap,
-        outputs: PortMap,
-        states: PortMap | None,
-        stop: float,
-    ) -> None:
-        self._inputs = inputs
-        self._readings = outputs if states is None else outputs + states
-        self._q, self._shows_states = len(outputs.variables), states is not None
-        self._time = 0.0
-        self._last: Array | None = None
+    def __init__(self, specs: Sequence[PlantSpec], shows_states: bool, stop: float) -> None:
+        self.shows_states = shows_states
+        self.names = tuple(spec.name for spec in specs)
+        self._specs = tuple(specs)
         library = _compiled_loop()
         messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
             paths = dict.fromkeys(spec.fmu for spec in specs)
             files = {path: stack.enter_context(FmuFile(path, messages)) for path in paths}
-            for file in files.values():
-                for ports in (inputs, outputs, states):
-                    if ports is not None:
-                        _check_ports(file, ports)
+            for fmu, ports in dict.fromkeys(
+                (spec.fmu, ports) for spec in specs for ports in (spec.inputs, spec.readings)
+            ):
+                _check_ports(files[fmu], ports)
             self._instances = [
-                stack.enter_context(_start(files[spec.fmu], name, spec, stop))
-                for name, spec in zip(agents, specs, strict=True)
+                stack.enter_context(_start(files[spec.fmu], spec, stop)) for spec in specs
             ]
-            self.fmus = Fmus(self._instances, inputs, self._readings, messages)
+            self.fmus = Fmus(
+                self._instances,
+                [spec.inputs for spec in specs],
+                [spec.readings for spec in specs],
+                messages,
+            )
             self._release = stack.pop_all()
-        self._loop = None
-        if library is not None:
-            self._loop = FmuLoop(self.fmus, library, len(self._readings.variables))
+        self.input_at, self.reading_at = self.fmus.input_at, self.fmus.reading_at
+        self._loop = None if library is None else FmuLoop(self.fmus, library)
 
-    @property
-    def shows_states(self) -> bool:
-        """Whether `states` returns x."""
-        return self._shows_states
+    @classmethod
+    def of_agents(
+        cls,
+        names: Sequence[str],
+        specs: Sequence[PlantSpec],
+        inputs: PortMap,
+        outputs: PortMap,
+        states: PortMap | None,
+        stop: float,
+    ) -> FmuPlant:
+        """Make the plants of agents that have the same ports and nothing wired.
 
-    def outputs(self) -> Array:
-        """Return y, (N, q)."""
-        return self._read()[:, : self._q]
+        Parameters
+        ----------
+        names : sequence of str
+        specs : sequence of PlantSpec
+            FMU and values of each agent.
+        inputs, outputs : PortMap
+        states : PortMap, optional
+            Where the FMU shows x.
+        stop : float
+            End of the run [s].
+        """
+        readings = outputs if states is None else outputs + states
+        whole = [
+            attrs.evolve(spec, name=name, inputs=inputs, readings=readings)
+            for name, spec in zip(names, specs, strict=True)
+        ]
+        return cls(whole, states is not None, stop)
 
-    def states(self) -> Array | None:
-        """Return x, (N, m), if the FMU shows it."""
-        return self._read()[:, self._q :] if self._shows_states else None
-
-    def _read(self) -> Array:
-        """Return outputs and states; FMUs are asked once per communication point."""
-        if self._last is None:
-            if self._loop is not None:
-                self._last = self._loop.read(self._time)
-            else:
-                self._last = self._read_one_by_one()
-        return self._last
-
-    def _read_one_by_one(self) -> Array:
-        scale, offset = np.array(self._readings.scale), np.array(self._readings.offset)
-        names = self._readings.variables
-        values = np.array([i.read(i.file.ports(names)) for i in self._instances])
-        return np.asarray((values - offset) / scale)
-
-    def step(self, k: int, t: float, h: float, U: Array) -> None:
-        """Set the inputs of every FMU and let it step."""
-        self._last = None
+    def read(self, which: Whole, time: float, readings: Array) -> None:
+        """Write the readings of some instances into those of all."""
         if self._loop is not None:
-            self._loop.step(t, h, U)
-        else:
-            values = U * np.array(self._inputs.scale) + np.array(self._inputs.offset)
-            for row, instance in zip(values, self._instances, strict=True):
-                instance.write(instance.file.ports(self._inputs.variables), row)
-                instance.do_step(t, h)
-        self._time = t + h
+            self._loop.read(which, time, readings)
+            return
+        for number in which:
+            instance, ports = self._instances[number], self._specs[number].readings
+            values = instance.read(instance.file.ports(ports.variables))
+            at = slice(self.reading_at[number], self.reading_at[number + 1])
+            readings[at] = (values - np.array(ports.offset)) / np.array(ports.scale)
+
+    def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
+        """Set the inputs of some instances and let them step."""
+        if self._loop is not None:
+            self._loop.step(which, t, h, inputs, readings)
+            return
+        for number, begin, length in zip(which, t, h, strict=True):
+            instance, ports = self._instances[number], self._specs[number].inputs
+            at = slice(self.input_at[number], self.input_at[number + 1])
+            values = inputs[at] * np.array(ports.scale) + np.array(ports.offset)
+            instance.write(instance.file.ports(ports.variables), values)
+            instance.do_step(float(begin), float(length))
+
+    def save(self, which: Whole) -> Any:
+        """Keep the states of some instances.
+
+        Raises
+        ------
+        FmuCallError
+            If an FMU cannot give its state.
+        """
+        return [(number, self._instances[number].get_state()) for number in which]
+
+    def restore(self, saved: Any) -> None:
+        """Go back to states that were kept."""
+        for number, state in saved:
+            self._instances[number].set_state(state)
 
     def stepped_to(self, time: float) -> None:
-        """Take note that the engine has taken the FMUs to this time [s]."""
-        self._time, self._last = time, None
+        """Note that the engine has taken the instances to a time [s]."""
         self.fmus.set_time(time)
 
     def close(self) -> None:
@@ -158,9 +195,9 @@ def _compiled_loop() -> ctypes.CDLL | None:
         return None
 
 
-def _start(file: FmuFile, agent: str, spec: PlantSpec, stop: float) -> FmuInstance:
-    instance = file.instantiate(agent)
-    instance.initialise(_existing(file, spec.values), stop=stop)
+def _start(file: FmuFile, spec: PlantSpec, stop: float) -> FmuInstance:
+    instance = file.instantiate(spec.name)
+    instance.initialise(_existing(file, spec.values), stop=stop, tolerance=spec.tolerance)
     return instance
 
 

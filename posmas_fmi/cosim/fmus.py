@@ -18,6 +18,7 @@ from posmas_fmi.fmu.variables import Ports
 _LOG = logging.getLogger(__name__)
 
 _int, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
 @attrs.frozen
@@ -94,15 +95,21 @@ class _Fmus(ctypes.Structure):
         ("bindings", _pointer),
         ("binding", _pointer),
         ("component", _pointer),
+        ("input_at", _pointer),
+        ("reading_at", _pointer),
         ("room", _int),
         ("messages", _pointer),
+        ("remote", _pointer),
+        ("is_remote", _pointer),
     )
 
 
-class _Incident(ctypes.Structure):
+class Incident(ctypes.Structure):
+    """Which call of an FMU was not right; ``call`` is 0 where none."""
+
     _fields_ = (
         ("call", _int),
-        ("agent", _int),
+        ("instance", _int),
         ("status", _int),
         ("port", _int),
         ("value", _double),
@@ -113,10 +120,10 @@ class _Incident(ctypes.Structure):
 class Report(ctypes.Structure):
     """What the C loops say about the calls of FMUs; ``failure.call`` is 0 where there is none."""
 
-    _fields_ = (("failure", _Incident), ("warning", _Incident), ("warnings", _int))
+    _fields_ = (("failure", Incident), ("warning", Incident), ("warnings", _int))
 
 
-_CALLS = {1: "Set", 2: "Get", 3: "DoStep", 4: "DoStep", 5: "DoStep", 6: "Get", 7: "Get"}
+_CALLS = ("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep")
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
 
 _KEPT, _LONGEST = 64, 1016
@@ -183,45 +190,64 @@ class NativeMessages:
 
 
 class Fmus:
-    """The FMU instances of all agents with their ports.
+    """FMU instances with their ports: the agents' first, then those that are no agents.
 
     Parameters
     ----------
     instances : sequence of FmuInstance
-        Initialised; one per agent. They must outlive this object.
-    inputs, readings : PortMap
-        What is set before and read after each step.
+        Initialised. They must outlive this object.
+    inputs, readings : sequence of PortMap
+        What is set before and read after each step, of each instance.
     messages : NativeMessages, optional
         Where the instances log, if not in Python.
+
+    Attributes
+    ----------
+    input_at, reading_at : (n + 1,) array of int
+        Where the inputs and readings of each instance begin among those of all.
     """
 
     def __init__(
         self,
         instances: Sequence[FmuInstance],
-        inputs: PortMap,
-        readings: PortMap,
+        inputs: Sequence[PortMap],
+        readings: Sequence[PortMap],
         messages: NativeMessages | None = None,
     ) -> None:
-        self._instances = tuple(instances)
+        self._instances = list(instances)
         self._messages = messages
+        self._readings = tuple(readings)
         self._keep: list[Any] = []  # what the structures point to
-        files = list(dict.fromkeys(instance.file for instance in instances))
-        number = {file: k for k, file in enumerate(files)}
-        self.names = {file: file.ports(readings.variables).names for file in files}
-        bindings = (_Binding * len(files))(*(self._bind(f, inputs, readings) for f in files))
-        places = np.array([number[instance.file] for instance in instances], dtype=np.int64)
-        components = np.array([instance.component for instance in instances], dtype=np.uintp)
-        self._keep += [bindings, places, components]
+        kinds = list(zip((i.file for i in instances), inputs, readings, strict=True))
+        number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
+        bindings = (_Binding * len(number))(*(self._bind(*kind) for kind in number))
+        places = np.array([number[kind] for kind in kinds], dtype=np.int64)
+        self._components = np.array([i.component for i in instances], dtype=np.uintp)
+        self.input_at = _starts([len(ports.variables) for ports in inputs])
+        self.reading_at = _starts([len(ports.variables) for ports in readings])
+        self._keep += [bindings, places]
         rooms = [max(b.inputs.n_values, b.readings.n_values) for b in bindings]
         self.room = -(-max(rooms) // 8) * 8  # whole cache lines
         self.structure = _Fmus(
             len(instances),
             ctypes.addressof(bindings),
             places.ctypes.data,
-            components.ctypes.data,
+            self._components.ctypes.data,
+            self.input_at.ctypes.data,
+            self.reading_at.ctypes.data,
             self.room,
             messages.address if messages else None,
+            None,
+            None,
         )
+
+    def __len__(self) -> int:
+        return len(self._instances)
+
+    def replace(self, number: int, instance: FmuInstance) -> None:
+        """Put a fresh instance of the same file in the place of one that has failed."""
+        self._instances[number] = instance
+        self._components[number] = instance.component
 
     def _bind(self, file: FmuFile, inputs: PortMap, readings: PortMap) -> _Binding:
         prefix, real = f"fmi{file.version}", "Real" if file.version == 2 else "Float64"
@@ -276,18 +302,18 @@ class Fmus:
         if report.warnings > 1:
             _LOG.warning("%d more calls of FMUs returned Warning", report.warnings - 1)
 
-    def error(self, report: Report, time: float) -> FmuCallError:
-        """Return the failure of a report as an error; the run stood at `time` [s]."""
-        failure = report.failure
+    def error(self, failure: Incident, time: float) -> FmuCallError:
+        """Return what went wrong as an error; the run stood at `time` [s]."""
         instance, function, messages = self._call_of(failure, time)
         if failure.call in (_TERMINATED, _EARLY):
             return instance.ended_early(failure.call == _TERMINATED, failure.value)
         if failure.call == _NOT_FINITE:
-            return instance.not_finite(self.names[instance.file][failure.port], failure.value)
+            name = self._readings[failure.instance].variables[failure.port]
+            return instance.not_finite(name, failure.value)
         return instance.status_error(function, failure.status, messages)
 
     def _call_of(self, incident: Any, time: float) -> tuple[FmuInstance, str, Sequence[str]]:
-        instance = self._instances[incident.agent]
+        instance = self._instances[incident.instance]
         instance.time = time
         function = _CALLS[incident.call]
         if function != "DoStep":
@@ -299,64 +325,79 @@ class Fmus:
 
 
 class FmuLoop:
-    """All FMUs stepped and read by one call each: for a loop that is written in Python.
+    """Many FMUs stepped and read by one call each: for a loop that is written in Python.
 
     Parameters
     ----------
     fmus : Fmus
     library : ctypes.CDLL
         Of `posmas_fmi.cosim.native.fmus_sources`.
-    width : int
-        Number of readings of each agent.
     """
 
-    def __init__(self, fmus: Fmus, library: ctypes.CDLL, width: int) -> None:
+    def __init__(self, fmus: Fmus, library: ctypes.CDLL) -> None:
         self._fmus = fmus
         self._step, self._read = library.fmus_step_all, library.fmus_read_all
-        self._step.argtypes = [_pointer, _double, _double, _pointer, _pointer, _pointer]
-        self._read.argtypes = [_pointer, _pointer, _pointer, _pointer]
+        self._step.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 6]
+        self._read.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 3]
         self._step.restype = self._read.restype = None
         self._scratch = np.zeros(fmus.room)
-        self._shape = (fmus.structure.n, width)
 
-    def step(self, t: float, h: float, inputs: Array) -> None:
-        """Set the inputs (N, p) of every FMU and let it step.
+    def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
+        """Set the inputs of some instances and let them step.
+
+        Parameters
+        ----------
+        which : (n,) array of int
+            Numbers of the instances.
+        t, h : (n,) array
+            From where, and how far [s].
+        inputs, readings : array
+            Of all instances, one after the other; the readings of those in other processes are
+            written.
 
         Raises
         ------
         FmuCallError
             For the first FMU that fails; those after it have not stepped.
         """
-        values, report = np.ascontiguousarray(inputs, dtype=float), Report()
+        report = Report()
         self._step(
             self._fmus.address,
-            t,
-            h,
-            values.ctypes.data,
+            which.ctypes.data,
+            len(which),
+            t.ctypes.data,
+            h.ctypes.data,
+            inputs.ctypes.data,
+            readings.ctypes.data,
             self._scratch.ctypes.data,
             ctypes.addressof(report),
         )
-        self._check(report, t)
+        self._check(report, float(t[0]))
 
-    def read(self, t: float) -> Array:
-        """Return the readings (N, width).
+    def read(self, which: Whole, t: float, readings: Array) -> None:
+        """Write the readings of some instances into those of all.
 
         Raises
         ------
         FmuCallError
             For the first FMU that fails.
         """
-        values, report = np.empty(self._shape), Report()
+        report = Report()
         self._read(
             self._fmus.address,
-            values.ctypes.data,
+            which.ctypes.data,
+            len(which),
+            readings.ctypes.data,
             self._scratch.ctypes.data,
             ctypes.addressof(report),
         )
         self._check(report, t)
-        return values
 
     def _check(self, report: Report, time: float) -> None:
         self._fmus.warn(report, time)
         if report.failure.call:
-            raise self._fmus.error(report, time)
+            raise self._fmus.error(report.failure, time)
+
+
+def _starts(sizes: Sequence[int]) -> Whole:
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)

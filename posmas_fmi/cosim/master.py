@@ -1,4 +1,4 @@
-"""The master: the communication loop over plants, observers, controllers and the channel."""
+"""The master: the communication loop over plants, controllers and the channel."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.channel import Channel, Mailbox
-from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
+from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
+from posmas_fmi.cosim.law import Heard, Law, Weights
 from posmas_fmi.cosim.plant import Plant
-from posmas_fmi.cosim.propagator import Propagator
+from posmas_fmi.cosim.wiring import Whole, Wiring
 from posmas_fmi.errors import FmuCallError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
-from posmas_fmi.protocol import Protocol
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +28,22 @@ Record = Callable[[float, dict[str, Array]], None]
 
 # Beyond this multiple of the largest initial value a run is called diverged and ends.
 DIVERGED = 1e4
+
+
+@attrs.frozen
+class Iteration:
+    """When a repeated step is good enough.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest change of a reading, relative to its size or 1, that counts as none.
+    most : int
+        Repetitions of a step at most.
+    """
+
+    tolerance: float = 1e-8
+    most: int = 20
 
 
 @attrs.frozen(eq=False)
@@ -38,7 +55,8 @@ class System:
     agent : Agent
         The model that observers and leader compute with.
     network : Network
-    protocol : Protocol
+    law : Law
+        The controllers.
     channel : Channel
         Over the arcs of the network and then one arc from the leader to each pinned agent.
     clock : Clock
@@ -47,32 +65,149 @@ class System:
     s0 : (m,) array
         Initial state of the leader.
     seed : int
-        Of the channel's random numbers.
+        Of the random numbers of channel and sensors.
+    wiring : Wiring, optional
+        Of inputs that no controller sets; none by default.
+    sensors : Sensors, optional
+        Noise and resolution; exact by default.
+    episodes : tuple of Episode
+        What is otherwise for a time.
+    leader_changes : tuple of (int, (m,) array)
+        Communication points at which the leader jumps to another state.
+    every : (instances,) array of int, optional
+        Period of each instance and its controller, in communication steps; 1 by default.
+    stages : tuple of arrays of int, optional
+        Instances that step one after the other: those of a later stage are given the readings of
+        earlier ones at the end of the step (Gauss-Seidel). All at once by default (Jacobi).
+    iteration : Iteration, optional
+        Repeat every step until the inputs that are wired fit the readings at its end.
     """
 
     agent: Agent
     network: Network
-    protocol: Protocol
+    law: Law
     channel: Channel
     clock: Clock
     xhat0: Array
     s0: Array
     seed: int = 0
+    wiring: Wiring = attrs.field()
+    sensors: Sensors | None = None
+    episodes: tuple[Episode, ...] = ()
+    leader_changes: tuple[tuple[int, Array], ...] = ()
+    every: Whole = attrs.field()
+    stages: tuple[Whole, ...] = attrs.field()
+    iteration: Iteration | None = None
+
+    @wiring.default
+    def _no_wiring(self) -> Wiring:
+        return Wiring.none(self.network.N)
+
+    @every.default
+    def _every_step(self) -> Whole:
+        return np.ones(self.instances, dtype=np.int64)
+
+    @stages.default
+    def _one_stage(self) -> tuple[Whole, ...]:
+        return (np.arange(self.instances),)
+
+    @property
+    def instances(self) -> int:
+        """Number of plants, those that are no agents included."""
+        return len(self.wiring.extras)
+
+    @property
+    def measured(self) -> int:
+        """How many quantities an agent measures."""
+        return self.agent.q + len(self.law.extras)
 
     @property
     def senders(self) -> Array:
         """Index of the agent that sends over each arc between agents."""
         return np.asarray(self.network.adjacency.indices)
 
+    @property
+    def timeline(self) -> Timeline:
+        """The episodes, with what holds without them."""
+        return Timeline(
+            self.network.N, self.measured, self.agent.p, self.channel.loss, self.episodes
+        )
+
+    def next_change(self, k: int) -> int:
+        """First communication point after k at which conditions or the leader change."""
+        jumps = (point for point, _ in self.leader_changes if point > k)
+        return min((self.timeline.next_change(k), *jumps))
+
+    def leader_at(self, k: int) -> Array | None:
+        """State to which the leader jumps at communication point k, if it does."""
+        return next((s for point, s in self.leader_changes if point == k), None)
+
+    def weights_with(self, arc_off: Array) -> Weights:
+        """Weights of the controllers where some arcs, numbered as in the channel, are missing."""
+        if not arc_off.any():
+            return self.law.weights
+        arcs = self.network.adjacency.nnz
+        from_leader = np.zeros(self.network.N)
+        from_leader[list(self.network.pinned)] = arc_off[arcs:]
+        return self.law.weights.without(np.concatenate([arc_off[:arcs], from_leader]) > 0)
+
 
 @attrs.define(eq=False)
 class State:
-    """All state of a run outside the plants."""
+    """All state of a run outside the plants.
+
+    Attributes
+    ----------
+    k : int
+        Communication steps done.
+    memory : (N, …) array
+        What the controllers remember; the estimates come first.
+    leader : (…) array
+        What the leader remembers.
+    mailbox : Mailbox
+    readings : array
+        Of all instances at k.
+    measured : (N, measured) array
+    pending : (N, …) array
+        What agents with a longer period will remember at its end.
+    u, applied, actuated : (N, p) array
+        Last input, what the controller takes it for, and what the actuator makes of it.
+    inputs : array
+        Of all instances, held over their present step.
+    """
 
     k: int
-    xhat: Array
-    s: Array
+    memory: Array
+    leader: Array
     mailbox: Mailbox
+    readings: Array
+    measured: Array
+    pending: Array
+    u: Array
+    applied: Array
+    actuated: Array
+    inputs: Array
+
+
+@attrs.frozen(eq=False)
+class Incident:
+    """An instance that failed while the run went on.
+
+    Attributes
+    ----------
+    instance : str
+        Name of the agent or component.
+    time : float
+        When [s].
+    reason : str
+    action : str
+        What was done: ``frozen`` or ``restarted``, with details.
+    """
+
+    instance: str
+    time: float
+    reason: str
+    action: str
 
 
 @attrs.frozen(eq=False)
@@ -96,6 +231,9 @@ class Outcome:
     messages, lost : int
     reason : str
         Empty for a complete run.
+    failed_agent : str
+    incidents : tuple of Incident
+        Instances that failed while the run went on.
     """
 
     ended: Literal["complete", "diverged", "failed", "cancelled"]
@@ -110,6 +248,7 @@ class Outcome:
     lost: int
     reason: str = ""
     failed_agent: str = ""
+    incidents: tuple[Incident, ...] = ()
 
 
 def simulate(
@@ -129,7 +268,8 @@ def simulate(
     plant : Plant
         Initialised at t = 0. Not closed here.
     record : callable, optional
-        Gets the time [s] and the arrays ``x, xhat, u, sec_u, y, s`` at every communication point.
+        Gets the time [s] and the arrays ``x, xhat, u, sec_u, y, s, measured, extra`` at every
+        communication point.
     progress : callable, optional
         Gets the number of steps done and in all.
 
@@ -139,7 +279,7 @@ def simulate(
         Also where the run diverged, an FMU failed, or it was interrupted: what was recorded
         before stays.
     """
-    return _Run(system, plant, record, progress).run()
+    return Run(system, plant, record, progress).run()
 
 
 class _Stop(Exception):  # noqa: N818  (ends the loop; no error)
@@ -147,29 +287,61 @@ class _Stop(Exception):  # noqa: N818  (ends the loop; no error)
         self.ended, self.reason, self.agent = ended, reason, agent
 
 
-class _Run:
-    """One pass through the loop, with the figures that the outcome needs."""
+class Run:
+    """One pass through the loop, with the figures that the outcome needs.
+
+    Parameters
+    ----------
+    system, plant, record, progress
+        As for `simulate`.
+    """
 
     def __init__(
         self, system: System, plant: Plant, record: Record | None, progress: Progress | None
     ) -> None:
         self.system, self.plant = system, plant
         self.record, self.progress = record, progress
-        self.step_estimate = Propagator.of(system.agent, system.clock.h)
-        self.pinned = np.array(system.network.pinned, dtype=int)
-        self.arcs = system.network.adjacency.nnz
+        network, agent, law = system.network, system.agent, system.law
+        self.pinned = np.array(network.pinned, dtype=int)
+        self.arcs = network.adjacency.nnz
+        self.timeline = system.timeline
+        self.always_draws = self.timeline.has("loss")
+        at, N = plant.reading_at[: network.N, None], network.N
+        self.y_at = at + np.arange(agent.q)
+        self.x_at = at + agent.q + np.arange(agent.m) if plant.shows_states else None
+        self.u_at = plant.input_at[:N, None] + np.arange(agent.p)
+        is_u = np.zeros(plant.input_at[-1], dtype=bool)
+        is_u[self.u_at] = True
+        self.extra_at = np.flatnonzero(~is_u)
+        memory = law.start(system.xhat0)
+        leader = law.lead(system.s0)
+        width = len(law.leader_message(leader))
+        empty = np.zeros((self.arcs + len(self.pinned), width))
         random = np.random.default_rng(system.seed)
-        empty = np.zeros((self.arcs + len(self.pinned), system.agent.m + system.agent.q))
         self.state = State(
-            0, system.xhat0.copy(), system.s0.copy(), Mailbox(system.channel, empty, random)
+            k=0,
+            memory=memory,
+            leader=leader,
+            mailbox=Mailbox(system.channel, empty, random),
+            readings=np.zeros(plant.reading_at[-1]),
+            measured=np.zeros((N, system.measured)),
+            pending=memory.copy(),
+            u=np.zeros((N, agent.p)),
+            applied=np.zeros((N, agent.p)),
+            actuated=np.zeros((N, agent.p)),
+            inputs=np.zeros(plant.input_at[-1]),
         )
+        self.drive = np.zeros(0)  # the exogenous signals at k
+        self.conditions = self.timeline.at(0)
+        self.weights = law.weights
         self.largest_initial = 0.0
-        self.min_state = np.full(system.network.N, np.inf)
-        self.min_time = np.zeros(system.network.N)
-        self.tracking = self.estimation = np.zeros(system.network.N)
+        self.min_state = np.full(N, np.inf)
+        self.min_time = np.zeros(N)
+        self.tracking = self.estimation = np.zeros(N)
         self.limit = np.inf
 
     def run(self) -> Outcome:
+        """Run to the end."""
         ended: Any = "complete"
         reason = agent = ""
         try:
@@ -199,58 +371,178 @@ class _Run:
 
     def _loop(self) -> None:
         clock, system, state = self.system.clock, self.system, self.state
-        agent, protocol = system.agent, system.protocol
+        everyone = np.arange(system.instances)
+        self.plant.read(everyone, 0.0, state.readings)
+        begins = everyone
         for k in range(clock.steps + 1):
             t = clock.time(k)
-            y, x = self.plant.outputs(), self.plant.states()
-            innovation = y - state.xhat @ agent.C.T
-            heard, heard_innovation, s_known = self._exchange(k, innovation)
-            U = protocol.control(state.xhat, heard, s_known)
-            sec_u = agent.sec_numpy(U)
-            self._observe(t, x, y, U, sec_u)
+            self._change_conditions(k)
+            self._measure(k, begins)
+            sent = rounded(system.law.send(state.memory, state.measured), system.channel.resolution)
+            heard = self._exchange(k, sent)
+            self._control(t, k, sent, heard)
+            self._observe(t)
             if k == clock.steps:
                 break
-            self.plant.step(k, t, clock.h, U)
-            held = sec_u @ agent.B.T + protocol.injection(innovation, heard_innovation)
-            state.xhat = self.step_estimate(t, state.xhat, held)
-            state.s = self.step_estimate(t, state.s[None, :], np.zeros((1, agent.m)))[0]
+            self._step(k)
+            self._remember(t, k)
             state.k = k + 1
+            begins = np.flatnonzero((k + 1) % system.every == 0)
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
 
-    def _exchange(self, k: int, innovation: Array) -> tuple[Array, Array, Array]:
-        """Send (x̂, innovation) over every arc and s to the pinned; return what is now held."""
-        state, m = self.state, self.system.agent.m
-        sent = np.concatenate([state.xhat, innovation], axis=1)[self.system.senders]
-        from_leader = np.zeros((len(self.pinned), sent.shape[1]))
-        from_leader[:, :m] = state.s
-        message = np.concatenate([sent, from_leader])
-        if k == 0:
-            state.mailbox.held = message
-        received = state.mailbox.exchange(k, message)
-        s_known = np.zeros_like(state.xhat)
-        s_known[self.pinned] = received[self.arcs :, :m]
-        return received[: self.arcs, :m], received[: self.arcs, m:], s_known
+    def _change_conditions(self, k: int) -> None:
+        system, state = self.system, self.state
+        self.drive = system.wiring.drive.rows(k, k + 1)[0]
+        if k == 0 or self.timeline.next_change(k - 1) == k:
+            self.conditions = self.timeline.at(k)
+            self.weights = system.weights_with(self.conditions.arc_off)
+        jump = system.leader_at(k)
+        if jump is not None:
+            state.leader = system.law.lead(jump)
 
-    def _observe(self, t: float, x: Array | None, y: Array, U: Array, sec_u: Array) -> None:
+    def _measure(self, k: int, begins: Whole) -> None:
+        """Measure y, then the rest, through the sensors."""
+        system, state, sensors = self.system, self.state, self.system.sensors
+        y = state.readings[self.y_at]
+        rest = system.wiring.take(system.wiring.measured, state.readings, self.drive)
+        value = np.concatenate([y, rest], axis=1) + self.conditions.sensor_offset
+        if sensors is not None:
+            value = value + sensors.noise_at(k, k + 1, system.seed)[0]
+            value = rounded(value, sensors.resolution)
+        if k > 0:
+            gain = self.conditions.sensor_gain
+            follows = state.measured + gain * (value - state.measured)
+            value = np.where(gain == 1.0, value, follows)
+        agents = begins[begins < system.network.N]
+        state.measured = state.measured.copy()
+        state.measured[agents] = value[agents]
+
+    def _exchange(self, k: int, sent: Array) -> Heard:
+        """Send over every arc and from the leader to the pinned; return what is now held."""
+        state, N = self.state, self.system.network.N
+        law, mailbox = self.system.law, self.state.mailbox
+        from_leader = np.broadcast_to(
+            law.leader_message(state.leader), (len(self.pinned), sent.shape[1])
+        )
+        message = np.concatenate([sent[self.system.senders], from_leader])
+        if k == 0:
+            mailbox.held = message
+        received = mailbox.exchange(k, message, self.conditions.loss if self.always_draws else None)
+        leader = np.zeros((N, sent.shape[1]))
+        leader[self.pinned] = received[self.arcs :]
+        age = mailbox.age(k) * self.system.clock.period / TICKS_PER_SECOND
+        silence = np.zeros((N, 2))
+        np.maximum.at(silence[:, 0], self._receivers, age[: self.arcs])
+        silence[self.pinned, 1] = age[self.arcs :]
+        return Heard(received[: self.arcs], leader, silence)
+
+    @property
+    def _receivers(self) -> Any:
+        starts = self.system.network.adjacency.indptr
+        return np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+
+    def _control(self, t: float, k: int, sent: Array, heard: Heard) -> None:
+        """Let the controllers decide whose period begins; the others' inputs stay."""
+        system, state, every = self.system, self.state, self.system.every[: len(sent)]
+        state.u, state.applied = state.u.copy(), state.applied.copy()
+        for period in np.unique(every):
+            mine = (every == period) & (k % period == 0)
+            if not mine.any():
+                continue
+            h = int(period) * system.clock.period / TICKS_PER_SECOND
+            decision = system.law.step(
+                t, h, state.measured, sent, heard, state.memory, self.weights
+            )
+            state.u[mine], state.applied[mine] = decision.u[mine], decision.applied[mine]
+            state.pending[mine] = decision.memory[mine]
+            gain = np.ones_like(decision.u) if k == 0 else self.conditions.actuator_gain
+            follows = state.actuated + gain * (decision.u - state.actuated)
+            actuated = np.where(gain == 1.0, decision.u, follows)
+            state.actuated = np.where(mine[:, None], actuated, state.actuated)
+
+    def _step(self, k: int) -> None:
+        """Set the inputs of the instances whose step begins; step those whose step ends."""
+        system, state = self.system, self.state
+        if system.iteration is None:
+            state.readings = self._step_once(k, state.readings.copy())
+            return
+        saved = self.plant.save(np.arange(system.instances))
+        latest = self._step_once(k, state.readings.copy())
+        # readings at the end of the step are guesses until the inputs made of them confirm them
+        for _ in range(system.iteration.most):
+            self.plant.restore(saved)
+            guess, latest = latest, self._step_once(k, latest.copy())
+            change = np.abs(latest - guess) / np.maximum(1.0, np.abs(latest))
+            if change.max(initial=0.0) <= system.iteration.tolerance:
+                break
+        else:
+            log.warning(
+                "the coupling did not settle at t = %g s: readings still change by %.2g",
+                system.clock.time(k),
+                change.max(),
+            )
+        state.readings = latest
+
+    def _step_once(self, k: int, latest: Array) -> Array:
+        """Step stage after stage; inputs are made of `latest`, which is brought up to date."""
+        system, state, clock = self.system, self.state, self.system.clock
+        for stage in system.stages:
+            begins = stage[k % system.every[stage] == 0]
+            self._set_inputs(begins, latest)
+            ends = stage[(k + 1) % system.every[stage] == 0]
+            if not len(ends):
+                continue
+            every = system.every[ends]
+            t = (k + 1 - every) * clock.period / TICKS_PER_SECOND
+            h = every * clock.period / TICKS_PER_SECOND
+            self.plant.step(ends, t, h, state.inputs, latest)
+            state.k = k + 1  # a reading that fails belongs to the next point
+            self.plant.read(ends, clock.time(k + 1), latest)
+            state.k = k
+        return latest
+
+    def _set_inputs(self, which: Whole, readings: Array) -> None:
+        state, at = self.state, self.plant.input_at
+        values = np.empty(at[-1])
+        values[self.u_at] = state.actuated
+        values[self.extra_at] = self.system.wiring.inputs(readings, self.drive)
+        chosen = np.zeros(len(at) - 1, dtype=bool)
+        chosen[which] = True
+        mine = np.repeat(chosen, np.diff(at))
+        state.inputs = np.where(mine, values, state.inputs)
+
+    def _remember(self, t: float, k: int) -> None:
+        state, system = self.state, self.system
+        ends = (k + 1) % system.every[: system.network.N] == 0
+        state.memory = np.where(ends[:, None], state.pending, state.memory)
+        state.leader = system.law.leader_step(t, system.clock.h, state.leader)
+
+    def _observe(self, t: float) -> None:
         """Record, and keep the figures of the outcome."""
-        state = self.state
+        state, m = self.state, self.system.agent.m
+        x = None if self.x_at is None else state.readings[self.x_at]
+        xhat, s = state.memory[:, :m], state.leader[:m]
         if self.record is not None:
-            row = {"xhat": state.xhat, "u": U, "sec_u": sec_u, "y": y, "s": state.s}
+            y = state.readings[self.y_at]
+            row = {"xhat": xhat, "u": state.u, "sec_u": state.applied, "y": y, "s": s}
             if x is not None:
                 row["x"] = x
+            row["measured"] = state.measured
+            recorded = np.array(self.system.wiring.recorded, dtype=np.int64)
+            row["extra"] = self.system.wiring.take(recorded, state.readings, self.drive)
             self.record(t, row)
-        truth = state.xhat if x is None else x
-        self.tracking, self.estimation = errors_at(truth, state.xhat, state.s)
+        truth = xhat if x is None else x
+        self.tracking, self.estimation = errors_at(truth, xhat, s)
         if state.k == 0:
             self.largest_initial = float(self.tracking.max())
-            scale = max(np.abs(truth).max(), np.abs(state.s).max(), np.abs(state.xhat).max(), 1.0)
+            scale = max(np.abs(truth).max(), np.abs(s).max(), np.abs(xhat).max(), 1.0)
             self.limit = DIVERGED * float(scale)
         lowest = reduce(np.minimum, truth.T)
         falls = lowest < self.min_state
         self.min_state = np.where(falls, lowest, self.min_state)
         self.min_time = np.where(falls, t, self.min_time)
-        size = np.maximum(_largest(truth), _largest(state.xhat))
+        size = np.maximum(_largest(truth), _largest(xhat))
         if not (size <= self.limit).all():
             self._diverged(t, size)
 

@@ -13,7 +13,6 @@ import attrs
 
 from posmas_fmi import resources
 from posmas_fmi.errors import BuildError
-from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import cache_folder, write
 from posmas_fmi.fmu.compile import FLAGS, host, shared_library
 from posmas_fmi.fmu.plant import agent_functions
@@ -22,7 +21,7 @@ from posmas_fmi.fmu.positive_agent import functions_header
 _HERE = Path(__file__).parent / "csrc"
 _EXPORT = Path(resources.__file__).parent / "fmu" / "csrc" / "export.h"
 _FMUS = ("fmus.h", "fmus.c", "message_log.h", "message_log.c")
-_ENGINE = ("controller.h", "controller.c", "engine.h", "engine.c", "threads.h", "threads.c")
+_ENGINE = ("engine.h", "engine.c", "threads.h", "threads.c", "controllers.c")
 _MORE_FLAGS = ("-O3", "-pthread")  # of the engine: unrolls the small matrix products
 
 
@@ -64,25 +63,20 @@ def fmus_sources() -> Sources:
     return Sources("fmus", _read(_FMUS))
 
 
-def engine_sources(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -> Sources:
-    """Return the sources of the engine for agents with these nonlinearities.
+def engine_sources(kind: str, header: str) -> Sources:
+    """Return the sources of the engine for one kind of controller.
 
     Parameters
     ----------
-    g, sec : VectorFunction
-        As for `posmas_fmi.fmu.positive_agent.positive_agent`.
-    m, p, q : int
-        Numbers of states, inputs, outputs.
-
-    Raises
-    ------
-    BuildError
-        If g or sec do not fit the sizes.
+    kind : str
+        Folder of ``controller.h`` and ``controller.c``.
+    header : str
+        ``agent_functions.h``: the sizes, and what the controller needs of the agent.
     """
-    header = functions_header(g, sec, m, p, q, slopes=False)
-    return Sources(
-        "engine", {**_read((*_FMUS, *_ENGINE)), "agent_functions.h": header}, _MORE_FLAGS
-    )
+    folder = _HERE / kind
+    own = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.[ch]"))}
+    files = {**_read((*_FMUS, *_ENGINE)), **own, "agent_functions.h": header}
+    return Sources("engine", files, _MORE_FLAGS)
 
 
 def library(sources: Sources, cache_to: Path | None = None) -> Path:
@@ -150,7 +144,8 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
         except (OSError, ValueError) as error:
             raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
         if isinstance(agent, dict):
-            wanted.append(engine_sources(*agent_functions(agent, f"{file}: $.agent")))
+            functions = agent_functions(agent, f"{file}: $.agent")
+            wanted.append(engine_sources("protocol", functions_header(*functions, slopes=False)))
     paths: list[Path] = []
     for sources in wanted:
         path = out_dir / sources.file_name

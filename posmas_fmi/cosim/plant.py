@@ -1,8 +1,9 @@
-"""Plants as the master sees them: read outputs, step with held inputs."""
+"""Plants as the master sees them: instances with readings, stepped with held inputs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 from typing import Protocol as Interface
 
 import attrs
@@ -11,25 +12,70 @@ import numpy as np
 from posmas_fmi.agent import Agent
 from posmas_fmi.expression import Array
 
+Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
+
 
 class Plant(Interface):
-    """All agents' plants. One call serves all of them, so that an engine may run them together."""
+    """All instances: the agents' first, then those that are no agents.
 
-    def outputs(self) -> Array:
-        """Return y, (N, q)."""
+    Inputs and readings of all instances stand one after the other in one array. The readings of an
+    agent begin with y, then x where it is shown; its inputs begin with u.
 
-    def states(self) -> Array | None:
-        """Return x, (N, m), where the plant shows it, else None."""
+    Attributes
+    ----------
+    input_at, reading_at : (instances + 1,) array of int
+        Where those of each instance begin.
+    shows_states : bool
+        Whether readings contain x.
+    """
 
-    def step(self, k: int, t: float, h: float, U: Array) -> None:
-        """Advance all agents from t by h [s] with the inputs U, (N, p), held."""
+    input_at: Whole
+    reading_at: Whole
+    shows_states: bool
+
+    def read(self, which: Whole, time: float, readings: Array) -> None:
+        """Write the readings of some instances, which stand at a time [s]."""
+
+    def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
+        """Advance some instances from t over h [s], (n,) each, with their inputs held.
+
+        Instances elsewhere than in this process write their readings at once.
+        """
+
+    def save(self, which: Whole) -> Any:
+        """Keep the states of some instances."""
+
+    def restore(self, saved: Any) -> None:
+        """Go back to states that were kept."""
 
     def close(self) -> None:
         """Release what the plant holds."""
 
 
-@attrs.define(eq=False)
-class ModelPlant:
+class _Agents:
+    """Plants of equal agents whose states are one array, stepped all together."""
+
+    x: Array
+    shows_states = True
+
+    def _sizes(self, n: int, p: int, width: int) -> None:
+        self.input_at = p * np.arange(n + 1)
+        self.reading_at = width * np.arange(n + 1)
+
+    def save(self, which: Whole) -> Any:
+        """Keep the states."""
+        return self.x.copy()
+
+    def restore(self, saved: Any) -> None:
+        """Go back to states that were kept."""
+        self.x = saved.copy()
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@attrs.define(eq=False, slots=False)
+class ModelPlant(_Agents):
     """Model (1) integrated by scipy, without an FMU: for tests and as an oracle.
 
     Parameters
@@ -46,34 +92,30 @@ class ModelPlant:
     rtol: float = 1e-10
     atol: float = 1e-12
 
-    def outputs(self) -> Array:
-        """Return y, (N, q)."""
-        return np.asarray(self.x @ self.agent.C.T)
+    def __attrs_post_init__(self) -> None:
+        self._sizes(len(self.x), self.agent.p, self.agent.q + self.agent.m)
 
-    def states(self) -> Array:
-        """Return x, (N, m)."""
-        return self.x
+    def read(self, which: Whole, time: float, readings: Array) -> None:
+        """Write y and x of every agent."""
+        readings[:] = np.concatenate([self.x @ self.agent.C.T, self.x], axis=1).ravel()
 
-    def step(self, k: int, t: float, h: float, U: Array) -> None:
-        """Advance all agents from t by h [s] with U held."""
+    def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
+        """Advance all agents with their inputs held."""
         from scipy.integrate import solve_ivp
 
-        shape = self.x.shape
+        shape, U = self.x.shape, inputs.reshape(len(self.x), -1)
 
         def rhs(time: float, flat: Array) -> Array:
             return self.agent.derivative(time, flat.reshape(shape), U).ravel()
 
         solution = solve_ivp(
-            rhs, (t, t + h), self.x.ravel(), method="DOP853", rtol=self.rtol, atol=self.atol
+            rhs, (t[0], t[0] + h[0]), self.x.ravel(), "DOP853", rtol=self.rtol, atol=self.atol
         )
         self.x = solution.y[:, -1].reshape(shape)
 
-    def close(self) -> None:
-        """Nothing to release."""
 
-
-@attrs.define(eq=False)
-class CallablePlant:
+@attrs.define(eq=False, slots=False)
+class CallablePlant(_Agents):
     """Plant from functions: a mock for tests of the algorithms.
 
     Parameters
@@ -81,28 +123,34 @@ class CallablePlant:
     output : callable
         ``output(x) -> (N, q)``.
     advance : callable
-        ``advance(k, t, h, x, U) -> (N, m)``.
+        ``advance(t, h, x, U) -> (N, m)``.
     x : (N, m) array
+    p : int
+        Inputs of an agent, those that are wired included.
     """
 
     output: Callable[[Array], Array]
-    advance: Callable[[int, float, float, Array, Array], Array]
+    advance: Callable[[float, float, Array, Array], Array]
     x: Array
+    p: int = 1
     calls: list[str] = attrs.field(factory=list)
 
-    def outputs(self) -> Array:
-        """Return y, (N, q)."""
+    def __attrs_post_init__(self) -> None:
+        width = self.output(self.x).shape[1] + self.x.shape[1]
+        self._sizes(len(self.x), self.p, width)
+
+    def read(self, which: Whole, time: float, readings: Array) -> None:
+        """Write the outputs and x of some agents."""
         self.calls.append("outputs")
-        return self.output(self.x)
+        rows = readings.reshape(len(self.x), -1)
+        rows[which] = np.concatenate([self.output(self.x), self.x], axis=1)[which]
 
-    def states(self) -> Array | None:
-        """Return x, (N, m)."""
-        return self.x
-
-    def step(self, k: int, t: float, h: float, U: Array) -> None:
-        """Advance by one call of `advance`."""
+    def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
+        """Advance some agents by one call of `advance`."""
         self.calls.append("step")
-        self.x = self.advance(k, t, h, self.x, U)
+        moved = self.advance(float(t[0]), float(h[0]), self.x, inputs.reshape(len(self.x), -1))
+        self.x = self.x.copy()
+        self.x[which] = moved[which]
 
     def close(self) -> None:
         """Note the call."""

@@ -16,6 +16,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Outcome, Progress, System
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
@@ -121,7 +122,8 @@ def run(
 
     designed = make_design_of(scenario)
     files = fmu_files(scenario)
-    choice = engine.choose(scenario.agent, scenario.settings.engine)
+    system = make_system(scenario, designed)
+    choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     _make_folder(folder)
     for name in ("summary.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
@@ -164,6 +166,7 @@ def _simulate(
             progress("simulate"),
             choice,
             scenario.settings.threads,
+            variables=RECORDED,
         )
         recorder.flush()
         baseline = None
@@ -210,14 +213,17 @@ def make_system(scenario: Scenario, designed: Design) -> System:
     return System(
         agent=scenario.agent,
         network=network,
-        protocol=make_protocol(
-            network,
-            designed.K,
-            designed.E,
-            designed.phi,
-            designed.mu,
-            designed.observer,
-            designed.protocol,
+        law=ProtocolLaw(
+            scenario.agent,
+            make_protocol(
+                network,
+                designed.K,
+                designed.E,
+                designed.phi,
+                designed.mu,
+                designed.observer,
+                designed.protocol,
+            ),
         ),
         channel=make_channel(scenario.channel, network, scenario.clock.h),
         clock=scenario.clock,

@@ -77,7 +77,7 @@ def make_plant(scenario: Scenario, files: list[Path]) -> FmuPlant:
                 values |= override.parameters
         specs.append(PlantSpec(path, values))
     states = _ports(scenario, "states", agent.m) if _shows_states(scenario) else None
-    return FmuPlant(
+    return FmuPlant.of_agents(
         scenario.network.names,
         specs,
         _required(scenario, "inputs", agent.p),

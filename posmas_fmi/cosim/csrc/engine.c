@@ -1,7 +1,7 @@
 /* See engine.h. Agents are divided among threads; one barrier per communication step.
  *
- * Estimates and innovations go to the slot of the *next* point, so within a step no thread writes
- * what another one reads. Each agent is computed by the same instructions whatever thread it
+ * Messages, memories and readings go to the place of the *next* point, so within a step no thread
+ * writes what another one reads. Each agent is computed by the same instructions whatever thread it
  * belongs to: the results do not depend on the number of threads. */
 #include "engine.h"
 
@@ -31,7 +31,8 @@ typedef struct {
 /* A thread, its agents, and where it is; all members of a team come to the same k and ended. */
 typedef struct {
     Team *team;
-    int64_t id, first, end;
+    int64_t id, first, end; /* agents */
+    int64_t first_other, end_other; /* instances that are no agents */
     double *scratch;
     Report *report;
     Thread thread;
@@ -42,24 +43,35 @@ typedef struct {
 
 /* ---- where things are ------------------------------------------------------------------------ */
 
-static int64_t width(const Engine *e)
-{
-    return Q + (e->shows_states ? M : 0);
-}
-
 static double *reading(const Engine *e, int64_t k, int64_t i)
 {
-    return e->readings + ((k & 1) * e->fmus->n + i) * width(e);
+    const Fmus *f = e->fmus;
+    return e->readings + (k & 1) * f->reading_at[f->n] + f->reading_at[i];
 }
 
-static double *estimate(const Engine *e, int64_t slot, int64_t i)
+static double *memory(const Engine *e, int64_t k, int64_t i)
 {
-    return e->xhat + (slot * (e->fmus->n + 1) + i) * M;
+    return e->memory + ((k & 1) * (e->agents + 1) + i) * MEMORY;
 }
 
-static double *innovation(const Engine *e, int64_t slot, int64_t i)
+static double *measured(const Engine *e, int64_t k, int64_t i)
 {
-    return e->innovation + (slot * (e->fmus->n + 1) + i) * Q;
+    return e->measured + ((k & 1) * e->agents + i) * MEASURED;
+}
+
+static double *message(const Engine *e, int64_t slot, int64_t i)
+{
+    return e->message + (slot * (e->agents + 1) + i) * MESSAGE;
+}
+
+static const double *own_values(const Engine *e, int64_t i)
+{
+    return OWN ? e->own_values + i * OWN : NULL;
+}
+
+static const Controller *controller(const Engine *e, int64_t i)
+{
+    return e->controllers + e->controller[i];
 }
 
 static double time_of(const Engine *e, int64_t k)
@@ -67,98 +79,165 @@ static double time_of(const Engine *e, int64_t k)
     return (double)(k * e->period) / 1e9;
 }
 
+/* The step of an instance [s] from the nominal period, never from differences of times. */
+static double step_of(const Engine *e, int64_t i)
+{
+    return (double)(e->every[i] * e->period) / 1e9;
+}
+
+static void copy(double *to, const double *from, int64_t n)
+{
+    for (int64_t j = 0; j < n; j++)
+        to[j] = from[j];
+}
+
+static double rounded(double value, double resolution)
+{
+    return resolution > 0 ? resolution * rint(value / resolution) : value;
+}
+
 /* ---- the channel ----------------------------------------------------------------------------- */
 
 typedef struct {
-    const double *estimate;
-    const double *innovation;
-} Heard;
-
-typedef struct {
     int64_t k;
-    int64_t slot;            /* of k */
+    int64_t slot, next;      /* of k and k + 1 */
+    int64_t row;             /* of this slice */
     const int32_t *arrivals; /* at k */
 } Point;
 
 static int64_t slot_before(const Engine *e, const Point *p, int64_t age)
 {
-    if (age > p->k)
-        age = p->k; /* until the first message has come the initial one is held */
     return p->slot >= age ? p->slot - age : p->slot - age + e->slots;
 }
 
-/* What is held at the end of an arc; a message that arrives now is taken. */
-static Heard hear(const Engine *e, const Point *p, int64_t arc, int64_t sender)
+/* What is held at the end of an arc, and its age in steps; a message that arrives now is taken. */
+static const double *hear(const Engine *e, const Point *p, int64_t arc, int64_t sender,
+                          int64_t *age)
 {
     if (!e->held) {
-        int64_t slot = e->delay ? slot_before(e, p, e->delay[arc]) : p->slot;
-        return (Heard){estimate(e, slot, sender), innovation(e, slot, sender)};
+        *age = e->delay ? e->delay[arc] : 0;
+        if (*age > p->k)
+            *age = p->k; /* until the first message has come the initial one is held */
+        return message(e, slot_before(e, p, *age), sender);
     }
-    double *held = e->held + arc * (M + Q);
+    double *held = e->held + arc * MESSAGE;
     if (p->arrivals[arc] >= 0) {
-        int64_t slot = slot_before(e, p, p->arrivals[arc]);
-        const double *x = estimate(e, slot, sender), *z = innovation(e, slot, sender);
-        for (int j = 0; j < M; j++)
-            held[j] = x[j];
-        for (int j = 0; j < Q; j++)
-            held[M + j] = z[j];
+        e->sent_at[arc] = p->k - p->arrivals[arc];
+        copy(held, message(e, slot_before(e, p, p->arrivals[arc]), sender), MESSAGE);
     }
-    return (Heard){held, held + M};
+    *age = p->k - e->sent_at[arc];
+    return held;
 }
 
-/* ---- one agent ------------------------------------------------------------------------------- */
-
-/* Gather what agent i has heard: the disagreement (M) of (6), the innovation (Q) of (5) or (22). */
+/* Gather what agent i has heard: the disagreement (MESSAGE) of (6) and, for what belongs to it, of
+ * the observer (22); and how long ago it was sent, by the neighbours and by the leader. */
 static void gather(const Engine *e, const Point *p, int64_t i, double *disagreement,
-                   double *correction)
+                   double *silence)
 {
-    double heard_x[M] = {0}, heard_z[Q] = {0};
+    enum { FIRST = MESSAGE - INNOVATION };
+    double heard[MESSAGE] = {0};
+    int64_t oldest = 0, from_leader = 0, age;
     for (int64_t arc = e->first_arc[i]; arc < e->first_arc[i + 1]; arc++) {
-        Heard from = hear(e, p, arc, e->sender[arc]);
-        for (int j = 0; j < M; j++)
-            heard_x[j] += e->weight[arc] * from.estimate[j];
+        const double *from = hear(e, p, arc, e->sender[arc], &age);
+        for (int j = 0; j < FIRST; j++)
+            heard[j] += e->weight[arc] * from[j];
         if (e->innovation_weight)
-            for (int j = 0; j < Q; j++)
-                heard_z[j] += e->innovation_weight[arc] * from.innovation[j];
+            for (int j = FIRST; j < MESSAGE; j++)
+                heard[j] += e->innovation_weight[arc] * from[j];
+        if (age > oldest)
+            oldest = age;
     }
-    const double *xhat = estimate(e, p->slot, i), *z = innovation(e, p->slot, i);
-    for (int j = 0; j < M; j++)
-        disagreement[j] = e->own[i] * xhat[j] - heard_x[j];
-    for (int j = 0; j < Q; j++)
-        correction[j] = e->own_innovation[i] * z[j] - heard_z[j];
+    const double *mine = message(e, p->slot, i);
+    for (int j = 0; j < FIRST; j++)
+        disagreement[j] = e->own[i] * mine[j] - heard[j];
+    for (int j = FIRST; j < MESSAGE; j++)
+        disagreement[j] = e->own_innovation[i] * mine[j] - heard[j];
     if (e->leader_arc[i] >= 0) {
-        const double *s = hear(e, p, e->leader_arc[i], e->fmus->n).estimate;
-        for (int j = 0; j < M; j++)
+        const double *s = hear(e, p, e->leader_arc[i], e->agents, &from_leader);
+        for (int j = 0; j < FIRST; j++)
             disagreement[j] -= e->leader[i] * s[j];
     }
+    silence[0] = (double)(oldest * e->period) / 1e9;
+    silence[1] = (double)(from_leader * e->period) / 1e9;
 }
 
-static void copy(double *to, const double *from, int n)
+/* ---- measuring ------------------------------------------------------------------------------- */
+
+/* A reading at point k, or an exogenous signal there; `row` is that of the signals. */
+static double source(const Engine *e, int64_t k, int64_t row, int64_t term)
 {
-    for (int j = 0; j < n; j++)
-        to[j] = from[j];
+    if (term < 0)
+        return e->drive[row * e->drives - 1 - term];
+    return e->readings[(k & 1) * e->fmus->reading_at[e->fmus->n] + term];
 }
 
-static void record(const Engine *e, int64_t row, const Point *p, int64_t i, const double *u,
-                   const double *sec_u)
+/* What agent i measures at point k; a sensor that is stuck shows what it showed before. */
+static void measure(const Engine *e, int64_t k, int64_t row, int64_t i)
 {
-    const int64_t at = row * e->fmus->n + i;
+    double *to = measured(e, k, i);
+    const double *y = reading(e, k, i), *before = measured(e, k - 1, i);
+    for (int j = 0; j < MEASURED; j++)
+        to[j] = j < Q ? y[j] : source(e, k, row, e->measured_from[i * (MEASURED - Q) + j - Q]);
+    if (e->noise)
+        for (int j = 0; j < MEASURED; j++)
+            to[j] += e->noise[(row * e->agents + i) * MEASURED + j];
+    if (!e->sensor_gain)
+        return;
+    for (int j = 0; j < MEASURED; j++) {
+        const int64_t at = i * MEASURED + j;
+        to[j] = rounded(to[j] + e->sensor_offset[at], e->sensor_resolution[at]);
+        if (e->sensor_gain[at] != 1 && k > 0)
+            to[j] = before[j] + e->sensor_gain[at] * (to[j] - before[j]);
+    }
+}
+
+/* Measure at point k and put what is sent there into its slot. */
+static void send(const Engine *e, int64_t k, int64_t slot, int64_t row, int64_t i)
+{
+    double *to = message(e, slot, i);
+    measure(e, k, row, i);
+    controller_send(controller(e, i), own_values(e, i), memory(e, k, i), measured(e, k, i), to);
+    if (e->resolution > 0)
+        for (int j = 0; j < MESSAGE; j++)
+            to[j] = rounded(to[j], e->resolution);
+}
+
+/* Whether state and estimate of agent i are finite and within the limit. */
+static int within(const Engine *e, int64_t k, int64_t i)
+{
+    const double *xhat = memory(e, k, i), *x = reading(e, k, i) + Q;
+    int good = 1;
+    for (int j = 0; j < M; j++) {
+        good &= fabs(xhat[j]) <= e->limit;
+        if (e->shows_states)
+            good &= fabs(x[j]) <= e->limit;
+    }
+    return good;
+}
+
+/* ---- recording ------------------------------------------------------------------------------- */
+
+static void record(const Engine *e, const Point *p, int64_t i)
+{
+    const int64_t at = p->row * e->agents + i;
     const double *values = reading(e, p->k, i);
     if (e->xhat_rows)
-        copy(e->xhat_rows + at * M, estimate(e, p->slot, i), M);
-    if (e->u)
-        copy(e->u + at * P, u, P);
-    if (e->sec_u)
-        copy(e->sec_u + at * P, sec_u, P);
-    if (e->y)
-        copy(e->y + at * Q, values, Q);
-    if (e->x && e->shows_states)
-        copy(e->x + at * M, values + Q, M);
+        copy(e->xhat_rows + at * M, memory(e, p->k, i), M);
+    if (e->u_rows)
+        copy(e->u_rows + at * P, e->u + i * P, P);
+    if (e->applied_rows)
+        copy(e->applied_rows + at * P, e->applied + i * P, P);
+    if (e->y_rows)
+        copy(e->y_rows + at * Q, values, Q);
+    if (e->x_rows && e->shows_states)
+        copy(e->x_rows + at * M, values + Q, M);
+    if (e->measured_rows)
+        copy(e->measured_rows + at * MEASURED, measured(e, p->k, i), MEASURED);
 }
 
 static void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
 {
-    const double *x = e->shows_states ? reading(e, p->k, i) + Q : estimate(e, p->slot, i);
+    const double *x = e->shows_states ? reading(e, p->k, i) + Q : memory(e, p->k, i);
     double lowest = x[0];
     for (int j = 1; j < M; j++)
         if (!(lowest <= x[j]))
@@ -169,83 +248,200 @@ static void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
     }
 }
 
-/* Whether state and estimate of agent i are finite and within the limit. */
-static int within(const Engine *e, int64_t k, int64_t slot, int64_t i)
+/* ---- one instance ---------------------------------------------------------------------------- */
+
+/* Whether a step of instance i begins at point k, and whether one ends at k + 1. */
+static int begins(const Engine *e, int64_t k, int64_t i)
 {
-    const double *xhat = estimate(e, slot, i), *x = reading(e, k, i) + Q;
-    int good = 1;
-    for (int j = 0; j < M; j++) {
-        good &= fabs(xhat[j]) <= e->limit;
-        if (e->shows_states)
-            good &= fabs(x[j]) <= e->limit;
-    }
-    return good;
+    return !e->frozen[i] && k % e->every[i] == 0;
 }
 
-/* Read the FMU at point k and compare with the estimate, which is there already. */
-static int read(const Engine *e, int64_t k, int64_t slot, int64_t i, double *scratch,
-                Report *report)
+static int ends(const Engine *e, int64_t k, int64_t i)
 {
-    if (!fmus_read(e->fmus, i, reading(e, k, i), scratch, report))
-        return 0;
-    controller_innovation(e->controller, reading(e, k, i), estimate(e, slot, i),
-                          innovation(e, slot, i));
+    return !e->frozen[i] && (k + 1) % e->every[i] == 0;
+}
+
+/* The input of agent i at a point, and what its controller remembers next. */
+static void control(const Engine *e, const Point *p, int64_t i, double t)
+{
+    double disagreement[MESSAGE], silence[2];
+    double *u = e->u + i * P, *actuated = e->actuated + i * P;
+    double *next = e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
+    gather(e, p, i, disagreement, silence);
+    controller_step(controller(e, i), own_values(e, i), t, measured(e, p->k, i), disagreement,
+                    silence, memory(e, p->k, i), next, u, e->applied + i * P);
+    for (int j = 0; j < P; j++) {
+        const double gain = e->actuator_gain && p->k > 0 ? e->actuator_gain[i * P + j] : 1;
+        actuated[j] = gain == 1 ? u[j] : actuated[j] + gain * (u[j] - actuated[j]);
+    }
+}
+
+/* Put the inputs of an instance together: u of an agent, then what it is wired to. */
+static void set_inputs(const Engine *e, const Point *p, int64_t i)
+{
+    double *to = e->inputs + e->fmus->input_at[i];
+    if (i < e->agents) {
+        copy(to, e->actuated + i * P, P);
+        to += P;
+    }
+    for (int64_t extra = e->first_extra[i]; extra < e->first_extra[i + 1]; extra++) {
+        double value = e->extra_bias[extra];
+        for (int64_t term = e->first_term[extra]; term < e->first_term[extra + 1]; term++)
+            value += e->term_weight[term] * source(e, p->k, p->row, e->term[term]);
+        *to++ = value;
+    }
+}
+
+/* Everything that belongs to an instance stays as it is. */
+static void carry(const Engine *e, const Point *p, int64_t i)
+{
+    const Fmus *f = e->fmus;
+    copy(reading(e, p->k + 1, i), reading(e, p->k, i), f->reading_at[i + 1] - f->reading_at[i]);
+    if (i >= e->agents)
+        return;
+    copy(measured(e, p->k + 1, i), measured(e, p->k, i), MEASURED);
+    copy(memory(e, p->k + 1, i), memory(e, p->k, i), MEMORY);
+    copy(message(e, p->next, i), message(e, p->slot, i), MESSAGE);
+}
+
+/* An instance did not do what it was told: the run ends, or goes on without it. */
+static void failed(const Engine *e, const Point *p, int64_t i, Report *report, Signal *signal)
+{
+    if (!e->freezes) {
+        signal->failed = 1;
+        return;
+    }
+    e->incident[i] = report->failure;
+    e->frozen[i] = 1;
+    report->failure.call = CALL_NONE;
+    signal->halt = 1;
+    carry(e, p, i);
+}
+
+/* What follows when the readings of instance i at k + 1 are there. */
+static void arrived(const Engine *e, const Point *p, int64_t i, Signal *signal)
+{
+    if (i >= e->agents)
+        return;
+    if (e->every[i] != 1)
+        copy(memory(e, p->k + 1, i), e->pending + i * MEMORY, MEMORY);
+    send(e, p->k + 1, p->next, p->row + 1, i);
+    if (!within(e, p->k + 1, i))
+        signal->diverging = 1;
+}
+
+/* Take instance i from k to k + 1; `posted` counts those that another process takes there. Returns
+ * whether the instances after it are to be stepped. */
+static int step(const Engine *e, const Member *me, const Point *p, int64_t i, int64_t *posted,
+                Signal *signal)
+{
+    const Fmus *f = e->fmus;
+    if (begins(e, p->k, i))
+        set_inputs(e, p, i);
+    if (!ends(e, p->k, i)) {
+        carry(e, p, i);
+        return 1;
+    }
+    const double t = time_of(e, p->k + 1 - e->every[i]), h = step_of(e, i);
+    const double *inputs = e->inputs + f->input_at[i];
+    if (fmus_is_remote(f, i)) {
+        f->remote->post(f->remote->context, i, t, h, inputs);
+        ++*posted;
+        return 1;
+    }
+    if (!fmus_step(f, i, t, h, inputs, me->scratch, me->report)) {
+        failed(e, p, i, me->report, signal);
+        return !signal->failed; /* the rest of this point is recorded */
+    }
+    if (fmus_read(f, i, reading(e, p->k + 1, i), me->scratch, me->report))
+        arrived(e, p, i, signal);
+    else
+        failed(e, p, i, me->report, signal);
     return 1;
 }
 
-/* ---- all agents of one thread ---------------------------------------------------------------- */
+/* ---- all instances of one thread ------------------------------------------------------------- */
 
-/* ---- all agents of one thread ---------------------------------------------------------------- */
-
-/* Read all FMUs at the point where the run begins. */
+/* Read all FMUs at the point where the run begins, and send what is known there. */
 static void read_first(const Engine *e, const Member *me, const Point *p, Signal *signal)
 {
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++)
-        if (!read(e, p->k, p->slot, i, me->scratch, me->report))
+        if (!fmus_read(e->fmus, i, reading(e, p->k, i), me->scratch, me->report))
             signal->failed = 1;
-        else if (!within(e, p->k, p->slot, i))
+    for (int64_t i = me->first_other; i < me->end_other; i++)
+        if (!fmus_read(e->fmus, i, reading(e, p->k, i), me->scratch, me->report))
+            signal->failed = 1;
+}
+
+static void send_first(const Engine *e, const Member *me, const Point *p, Signal *signal)
+{
+    *signal = (Signal){0};
+    for (int64_t i = me->first; i < me->end; i++) {
+        if (begins(e, p->k, i))
+            send(e, p->k, p->slot, 0, i);
+        if (!within(e, p->k, i))
             signal->diverging = 1;
+    }
+    if (me->id == 0)
+        controller_leader_send(e->controllers, memory(e, p->k, e->agents),
+                               message(e, p->slot, e->agents));
+}
+
+/* Wait for what was posted by this thread. */
+static void wait_for_posted(const Engine *e, const Member *me, const Point *p, int64_t from,
+                            int64_t to, Signal *signal)
+{
+    const Remote *remote = e->fmus->remote;
+    for (int64_t i = from; i < to; i++) {
+        if (!e->fmus->is_remote[i] || !ends(e, p->k, i))
+            continue;
+        if (remote->wait(remote->context, i, reading(e, p->k + 1, i), me->report))
+            arrived(e, p, i, signal);
+        else
+            failed(e, p, i, me->report, signal);
+    }
 }
 
 /* Control and record at a point; if `go`, step to the next one and read there. */
-static void advance(const Engine *e, const Member *me, const Point *p, int64_t row, int go,
-                    Signal *signal)
+static void advance(const Engine *e, const Member *me, const Point *p, int go, Signal *signal)
 {
     const double t = time_of(e, p->k);
-    const int64_t next = p->slot + 1 < e->slots ? p->slot + 1 : 0;
     int steps = go;
+    int64_t posted = 0;
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++) {
-        double disagreement[M], correction[Q], u[P], sec_u[P];
-        gather(e, p, i, disagreement, correction);
-        controller_input(e->controller, disagreement, u, sec_u);
-        record(e, row, p, i, u, sec_u);
+        if (begins(e, p->k, i))
+            control(e, p, i, t);
+        record(e, p, i);
         note_lowest(e, p, i, t);
-        if (!steps)
-            continue;
-        if (!fmus_step(e->fmus, i, t, e->controller->h, u, me->scratch, me->report)) {
-            signal->failed = 1;
-            steps = 0; /* the rest of this point is recorded */
-            continue;
-        }
-        controller_observe(e->controller, t, sec_u, correction, estimate(e, p->slot, i),
-                           estimate(e, next, i));
-        if (!read(e, p->k + 1, next, i, me->scratch, me->report))
-            signal->failed = 1;
-        else if (!within(e, p->k + 1, next, i))
-            signal->diverging = 1;
+        if (steps)
+            steps = step(e, me, p, i, &posted, signal);
+    }
+    for (int64_t i = me->first_other; i < me->end_other && steps; i++)
+        steps = step(e, me, p, i, &posted, signal);
+    if (posted) {
+        e->fmus->remote->send(e->fmus->remote->context);
+        wait_for_posted(e, me, p, me->first, me->end, signal);
+        wait_for_posted(e, me, p, me->first_other, me->end_other, signal);
     }
     if (me->id != 0)
         return;
-    const double *s = estimate(e, p->slot, e->fmus->n);
-    if (e->s)
-        copy(e->s + row * M, s, M);
+    const double *leader = memory(e, p->k, e->agents);
+    if (e->s_rows)
+        copy(e->s_rows + p->row * M, leader, M);
     if (e->time)
-        e->time[row] = t;
-    if (go)
-        controller_leader(e->controller, t, s, estimate(e, next, e->fmus->n));
-    signal->halt = __atomic_load_n(&e->halt, __ATOMIC_ACQUIRE) != 0;
+        e->time[p->row] = t;
+    if (e->extra_rows)
+        for (int64_t j = 0; j < e->extra_columns; j++)
+            e->extra_rows[p->row * e->extra_columns + j] =
+                source(e, p->k, p->row, e->recorded[j]);
+    if (go) {
+        controller_leader(e->controllers, t, leader, memory(e, p->k + 1, e->agents));
+        controller_leader_send(e->controllers, memory(e, p->k + 1, e->agents),
+                               message(e, p->next, e->agents));
+    }
+    signal->halt |= __atomic_load_n(&e->halt, __ATOMIC_ACQUIRE) != 0;
 }
 
 /* Wait for the others; what any of them says. */
@@ -266,16 +462,20 @@ static void run(Member *me)
 {
     Team *team = me->team;
     const Engine *e = team->e;
-    Point p = {e->k, e->k % e->slots, e->arrivals};
+    Point p = {e->k, e->k % e->slots, (e->k + 1) % e->slots, 0, e->arrivals};
     Signal all = {0};
-    if (!e->ready) {
-        read_first(e, me, &p, &team->signals[(p.k + 1) & 1][me->id]);
+    if (e->ready == 0) {
+        read_first(e, me, &p, &team->signals[p.k & 1][me->id]);
+        all = meet(team, p.k);
+    }
+    if (e->ready != 1 && !all.failed) {
+        send_first(e, me, &p, &team->signals[(p.k + 1) & 1][me->id]);
         all = meet(team, p.k + 1);
         me->diverging = all.diverging;
     }
     while (!all.failed && !all.halt && p.k < e->until) {
         const int go = !me->diverging && p.k < e->steps;
-        advance(e, me, &p, p.k - e->k, go, &team->signals[p.k & 1][me->id]);
+        advance(e, me, &p, go, &team->signals[p.k & 1][me->id]);
         all = meet(team, p.k);
         me->k = p.k + 1;
         if (!go) {
@@ -284,7 +484,9 @@ static void run(Member *me)
         }
         me->diverging = all.diverging;
         p.k++;
-        p.slot = p.slot + 1 < e->slots ? p.slot + 1 : 0;
+        p.row++;
+        p.slot = p.next;
+        p.next = p.next + 1 < e->slots ? p.next + 1 : 0;
         if (p.arrivals)
             p.arrivals += e->all_arcs;
     }
@@ -319,7 +521,7 @@ EXPORT void engine_run(Engine *e)
 {
     Team team = {.e = e};
     Member members[MAX_THREADS];
-    const int64_t n = e->fmus->n;
+    const int64_t n = e->agents, others = e->fmus->n - n;
     int64_t started = 1;
     e->rows = 0;
     for (int64_t id = 0; id < e->threads; id++) {
@@ -328,6 +530,8 @@ EXPORT void engine_run(Engine *e)
                                .id = id,
                                .first = n * id / e->threads,
                                .end = n * (id + 1) / e->threads,
+                               .first_other = n + others * id / e->threads,
+                               .end_other = n + others * (id + 1) / e->threads,
                                .scratch = e->scratch + id * e->fmus->room,
                                .report = &e->reports[id],
                                .k = e->k,
@@ -352,7 +556,8 @@ EXPORT void engine_run(Engine *e)
         return;
     e->ready = 1;
     const int64_t call = e->reports->failure.call;
-    const int stepped = me->ended == GOES_ON || (me->ended == FAILED && call >= CALL_GET);
+    const int reading = call == CALL_GET || call == CALL_NOT_FINITE;
+    const int stepped = me->ended == GOES_ON || (me->ended == FAILED && reading);
     e->k = stepped ? me->k : me->k - (me->k > e->k);
 }
 

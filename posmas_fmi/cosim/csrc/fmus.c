@@ -30,9 +30,9 @@ static int fail(Report *report, Incident incident)
 }
 
 /* A status other than OK: note it; whether the run goes on. */
-static int odd(int status, Call call, int64_t agent, int64_t before, Report *report)
+static int odd(int status, Call call, int64_t instance, int64_t before, Report *report)
 {
-    Incident incident = {.call = call, .agent = agent, .status = status, .said = before};
+    Incident incident = {.call = call, .instance = instance, .status = status, .said = before};
     if (status != WARNING)
         return fail(report, incident);
     if (!report->warnings++)
@@ -43,6 +43,8 @@ static int odd(int status, Call call, int64_t agent, int64_t before, Report *rep
 static int get(const Binding *b, void *component, const Ports *p, double *values)
 {
     size_t n = (size_t)p->n_references;
+    if (!n)
+        return OK;
     if (b->fmi == 2)
         return ((Get2 *)b->get)(component, p->references, n, values);
     return ((Get3 *)b->get)(component, p->references, n, values, (size_t)p->n_values);
@@ -51,20 +53,22 @@ static int get(const Binding *b, void *component, const Ports *p, double *values
 static int set(const Binding *b, void *component, const Ports *p, const double *values)
 {
     size_t n = (size_t)p->n_references;
+    if (!n)
+        return OK;
     if (b->fmi == 2)
         return ((Set2 *)b->set)(component, p->references, n, values);
     return ((Set3 *)b->set)(component, p->references, n, values, (size_t)p->n_values);
 }
 
 /* The values of an exchange from the inputs; false: those beside them could not be read. */
-static int convert(const Fmus *f, const Binding *b, int64_t agent, const double *inputs,
+static int convert(const Fmus *f, const Binding *b, int64_t instance, const double *inputs,
                    double *values, Report *report)
 {
     const Ports *p = &b->inputs;
     if (p->partial) {
         const int64_t before = said(f);
-        const int status = get(b, f->component[agent], p, values);
-        if (status != OK && !odd(status, CALL_GET_BEFORE_SET, agent, before, report))
+        const int status = get(b, f->component[instance], p, values);
+        if (status != OK && !odd(status, CALL_GET_BEFORE_SET, instance, before, report))
             return 0;
     }
     for (int64_t k = 0; k < p->n_ports; k++)
@@ -73,50 +77,52 @@ static int convert(const Fmus *f, const Binding *b, int64_t agent, const double 
     return 1;
 }
 
-int fmus_step(const Fmus *f, int64_t agent, double t, double h, const double *inputs,
+int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double *inputs,
               double *scratch, Report *report)
 {
-    const Binding *b = &f->bindings[f->binding[agent]];
-    void *component = f->component[agent];
+    const Binding *b = &f->bindings[f->binding[instance]];
+    void *component = f->component[instance];
     if (b->inputs.places || b->inputs.scale) {
-        if (!convert(f, b, agent, inputs, scratch, report))
+        if (!convert(f, b, instance, inputs, scratch, report))
             return 0;
         inputs = scratch;
     }
     int64_t before = said(f);
     int status = set(b, component, &b->inputs, inputs);
-    if (status != OK && !odd(status, CALL_SET, agent, before, report))
+    if (status != OK && !odd(status, CALL_SET, instance, before, report))
         return 0;
     before = said(f);
     if (b->fmi == 2) {
         status = ((Step2 *)b->do_step)(component, t, h, 0);
-        return status == OK || odd(status, CALL_STEP, agent, before, report);
+        return status == OK || odd(status, CALL_STEP, instance, before, report);
     }
     bool event = false, terminate = false, early = false;
     double reached = t;
     status = ((Step3 *)b->do_step)(component, t, h, false, &event, &terminate, &early, &reached);
-    if (status != OK && !odd(status, CALL_STEP, agent, before, report))
+    if (status != OK && !odd(status, CALL_STEP, instance, before, report))
         return 0;
     if (!terminate && !early)
         return 1;
     const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
-    return fail(report, (Incident){.call = call, .agent = agent, .value = reached});
+    return fail(report, (Incident){.call = call, .instance = instance, .value = reached});
 }
 
-int fmus_read(const Fmus *f, int64_t agent, double *values, double *scratch, Report *report)
+int fmus_read(const Fmus *f, int64_t instance, double *values, double *scratch, Report *report)
 {
-    const Binding *b = &f->bindings[f->binding[agent]];
+    if (fmus_is_remote(f, instance))
+        return f->remote->read(f->remote->context, instance, values, report);
+    const Binding *b = &f->bindings[f->binding[instance]];
     const Ports *p = &b->readings;
     const int direct = !p->places && !p->scale;
     const int64_t before = said(f);
-    const int status = get(b, f->component[agent], p, direct ? values : scratch);
-    if (status != OK && !odd(status, CALL_GET, agent, before, report))
+    const int status = get(b, f->component[instance], p, direct ? values : scratch);
+    if (status != OK && !odd(status, CALL_GET, instance, before, report))
         return 0;
     for (int64_t k = 0; k < p->n_ports; k++) {
         const double value = direct ? values[k] : scratch[p->places ? p->places[k] : k];
         if (!isfinite(value))
             return fail(report, (Incident){.call = CALL_NOT_FINITE,
-                                           .agent = agent,
+                                           .instance = instance,
                                            .port = k,
                                            .value = value});
         if (!direct)
@@ -127,25 +133,41 @@ int fmus_read(const Fmus *f, int64_t agent, double *values, double *scratch, Rep
 
 int incident_before(const Incident *a, const Incident *b)
 {
-    const int a_read = a->call >= CALL_GET, b_read = b->call >= CALL_GET;
-    return a_read != b_read ? b_read : a->agent < b->agent;
+    const int a_read = a->call == CALL_GET || a->call == CALL_NOT_FINITE;
+    const int b_read = b->call == CALL_GET || b->call == CALL_NOT_FINITE;
+    return a_read != b_read ? b_read : a->instance < b->instance;
 }
 
-/* ---- all agents in one call, for a loop that is not in C ------------------------------------- */
+/* ---- many instances in one call, for a loop that is not in C --------------------------------- */
 
-EXPORT void fmus_step_all(const Fmus *f, double t, double h, const double *inputs, double *scratch,
-                          Report *report)
+/* Step the instances numbered `which`, each from its own time over its own step. */
+EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const double *t,
+                          const double *h, const double *inputs, double *readings,
+                          double *scratch, Report *report)
 {
-    for (int64_t i = 0; i < f->n; i++)
-        if (!fmus_step(f, i, t, h, inputs + i * f->bindings[f->binding[i]].inputs.n_ports, scratch,
-                       report))
-            return;
+    int64_t posted = 0;
+    for (int64_t k = 0; k < n; k++) {
+        const int64_t i = which[k];
+        if (fmus_is_remote(f, i)) {
+            f->remote->post(f->remote->context, i, t[k], h[k], inputs + f->input_at[i]);
+            posted++;
+        } else if (!fmus_step(f, i, t[k], h[k], inputs + f->input_at[i], scratch, report)) {
+            break;
+        }
+    }
+    if (!posted)
+        return;
+    f->remote->send(f->remote->context);
+    for (int64_t k = 0; k < n; k++)
+        if (fmus_is_remote(f, which[k]))
+            f->remote->wait(f->remote->context, which[k], readings + f->reading_at[which[k]],
+                            report);
 }
 
-EXPORT void fmus_read_all(const Fmus *f, double *readings, double *scratch, Report *report)
+EXPORT void fmus_read_all(const Fmus *f, const int64_t *which, int64_t n, double *readings,
+                          double *scratch, Report *report)
 {
-    for (int64_t i = 0; i < f->n; i++)
-        if (!fmus_read(f, i, readings + i * f->bindings[f->binding[i]].readings.n_ports, scratch,
-                       report))
+    for (int64_t k = 0; k < n; k++)
+        if (!fmus_read(f, which[k], readings + f->reading_at[which[k]], scratch, report))
             return;
 }

@@ -1,4 +1,4 @@
-/* The FMU instances of all agents, FMI 2 and 3: set the inputs, step, read outputs and states. */
+/* FMU instances, FMI 2 and 3: set the inputs, step, read outputs and states. */
 #ifndef FMUS_H
 #define FMUS_H
 
@@ -30,15 +30,6 @@ typedef struct {
     Ports readings; /* outputs y, then states x where they are shown */
 } Binding;
 
-typedef struct {
-    int64_t n;                  /* agents */
-    const Binding *bindings;
-    const int64_t *binding;     /* of each agent */
-    void *const *component;     /* of each agent */
-    int64_t room;               /* values in the largest exchange */
-    const MessageLog *messages; /* NULL: kept elsewhere */
-} Fmus;
-
 typedef enum {
     CALL_NONE,
     CALL_SET,
@@ -47,13 +38,15 @@ typedef enum {
     CALL_STEP_TERMINATED, /* the FMU asked to end the simulation */
     CALL_STEP_EARLY,      /* FMI 3: returned early */
     CALL_GET,
-    CALL_NOT_FINITE /* a value that was read */
+    CALL_NOT_FINITE,      /* a value that was read */
+    CALL_WORKER_DIED,     /* the process that runs the FMU */
+    CALL_DEADLINE         /* it did not answer in time */
 } Call;
 
 /* Which call was not right. */
 typedef struct {
     int64_t call; /* one of Call */
-    int64_t agent;
+    int64_t instance;
     int64_t status;
     int64_t port;  /* which value is not finite */
     double value;  /* it, or the time that a step got to */
@@ -66,13 +59,42 @@ typedef struct {
     int64_t warnings;
 } Report;
 
-/* Both return whether all went well; inputs and values are those of the ports, `scratch` has room
- * for an exchange. */
-int fmus_step(const Fmus *fmus, int64_t agent, double t, double h, const double *inputs,
-              double *scratch, Report *report);
-int fmus_read(const Fmus *fmus, int64_t agent, double *values, double *scratch, Report *report);
+/* Instances in other processes: their steps are posted, sent together, and waited for. Inputs and
+ * readings are those of the ports, as for `fmus_step` and `fmus_read`. */
+typedef struct {
+    void *context;
+    void (*post)(void *context, int64_t instance, double t, double h, const double *inputs);
+    void (*send)(void *context); /* wake each process that has work, once */
+    int (*wait)(void *context, int64_t instance, double *readings, Report *report);
+    int (*read)(void *context, int64_t instance, double *readings, Report *report); /* no step */
+} Remote;
 
-/* Of two failures in one communication step, whether `a` is the one that a loop over all agents
+/* All instances: the agents' first, then those that are no agents. */
+typedef struct {
+    int64_t n;
+    const Binding *bindings;
+    const int64_t *binding;     /* of each instance */
+    void *const *component;     /* of each instance */
+    const int64_t *input_at;    /* (n + 1) where its inputs stand among those of all */
+    const int64_t *reading_at;  /* (n + 1) and its readings */
+    int64_t room;               /* values in the largest exchange */
+    const MessageLog *messages; /* NULL: kept elsewhere */
+    const Remote *remote;       /* NULL: none */
+    const int64_t *is_remote;   /* of each instance */
+} Fmus;
+
+static inline int fmus_is_remote(const Fmus *f, int64_t instance)
+{
+    return f->remote && f->is_remote[instance];
+}
+
+/* Both return whether all went well; inputs and values are those of the ports, `scratch` has room
+ * for an exchange. A remote instance is read only; its steps go through `remote`. */
+int fmus_step(const Fmus *fmus, int64_t instance, double t, double h, const double *inputs,
+              double *scratch, Report *report);
+int fmus_read(const Fmus *fmus, int64_t instance, double *values, double *scratch, Report *report);
+
+/* Of two failures in one communication step, whether `a` is the one that a loop over all instances
  * that steps, and then one that reads, meets first. */
 int incident_before(const Incident *a, const Incident *b);
 

@@ -63,32 +63,40 @@ static inline void propagate(const Controller *c, double t, const double *x, con
     copy(next, stage);
 }
 
-void controller_innovation(const Controller *c, const double *y, const double *xhat,
-                           double *innovation)
+void controller_send(const Controller *c, const double *own, const double *memory,
+                     const double *measured, double *message)
 {
     double estimate[Q];
-    set_product(estimate, c->C, xhat, Q, M);
+    (void)own;
+    copy(message, memory);
+    set_product(estimate, c->C, memory, Q, M);
     for (int i = 0; i < Q; i++)
-        innovation[i] = y[i] - estimate[i];
+        message[M + i] = measured[i] - estimate[i];
 }
 
-void controller_input(const Controller *c, const double *disagreement, double *u, double *sec_u)
-{
-    set_product(u, c->K, disagreement, P, M);
-    agent_sec(u, sec_u);
-}
-
-void controller_observe(const Controller *c, double t, const double *sec_u,
-                        const double *innovation, const double *xhat, double *next)
+void controller_step(const Controller *c, const double *own, double t, const double *measured,
+                     const double *disagreement, const double *silence, const double *memory,
+                     double *next, double *u, double *applied)
 {
     double held[M];
-    set_product(held, c->B, sec_u, M, P);
-    add_product(held, c->E, innovation, M, Q);
-    propagate(c, t, xhat, held, next);
+    (void)own, (void)measured, (void)silence;
+    set_product(u, c->K, disagreement, P, M);
+    agent_sec(u, applied);
+    set_product(held, c->B, applied, M, P);
+    add_product(held, c->E, disagreement + M, M, Q);
+    propagate(c, t, memory, held, next);
 }
 
-void controller_leader(const Controller *c, double t, const double *s, double *next)
+void controller_leader(const Controller *c, double t, const double *memory, double *next)
 {
     const double none[M] = {0};
-    propagate(c, t, s, none, next);
+    propagate(c, t, memory, none, next);
+}
+
+void controller_leader_send(const Controller *c, const double *memory, double *message)
+{
+    (void)c;
+    copy(message, memory);
+    for (int i = 0; i < INNOVATION; i++)
+        message[M + i] = 0;
 }

@@ -1,0 +1,290 @@
+"""The controllers of all agents as the master sees them: what is sent, and what follows from it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+from typing import Protocol as Interface
+
+import attrs
+import numpy as np
+import scipy.sparse as sp
+
+from posmas_fmi.agent import Agent
+from posmas_fmi.cosim.propagator import Propagator
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array, VectorFunction
+from posmas_fmi.protocol import Protocol
+
+if TYPE_CHECKING:
+    from posmas_fmi.cosim.native import Sources
+
+
+@attrs.frozen(eq=False)
+class Heard:
+    """What the agents hold of others at a communication point.
+
+    Attributes
+    ----------
+    messages : (arcs, w) array
+        Last message over each arc between agents.
+    leader : (N, w) array
+        Last message from the leader; zero where an agent is not pinned.
+    silence : (N, 2) array
+        How long ago the oldest of the last messages from neighbours was sent, and that of the
+        leader [s].
+    """
+
+    messages: Array
+    leader: Array
+    silence: Array
+
+
+@attrs.frozen(eq=False)
+class Weights:
+    """How a message enters the disagreement of the agents that hear it; see `Protocol`.
+
+    The last `innovation` values of a message have the weights of the observer (22), those before
+    them the weights of (6).
+
+    Attributes
+    ----------
+    own, leader, own_innovation : (N,) array
+    heard, heard_innovation : (N, arcs) sparse array
+    innovation : int
+    """
+
+    own: Array
+    heard: sp.csr_array
+    leader: Array
+    own_innovation: Array
+    heard_innovation: sp.csr_array
+    innovation: int = 0
+
+    @classmethod
+    def of(cls, protocol: Protocol, innovation: int) -> Weights:
+        """Take the weights of a protocol."""
+        return cls(
+            protocol.own,
+            protocol.heard,
+            protocol.leader,
+            protocol.own_innovation,
+            protocol.heard_innovation,
+            innovation,
+        )
+
+    def disagreement(self, sent: Array, heard: Heard) -> Array:
+        """Weighted disagreement of each agent with what it has heard, (N, w)."""
+        first = sent.shape[1] - self.innovation
+        main = (
+            self.own[:, None] * sent[:, :first]
+            - self.heard @ heard.messages[:, :first]
+            - self.leader[:, None] * heard.leader[:, :first]
+        )
+        rest = (
+            self.own_innovation[:, None] * sent[:, first:]
+            - self.heard_innovation @ heard.messages[:, first:]
+        )
+        return np.concatenate([main, rest], axis=1)
+
+    def without(self, off: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Weights:
+        """Leave arcs out of the digraph.
+
+        Parameters
+        ----------
+        off : (arcs + N,) array of bool
+            Arcs between agents, then the arc from the leader to each agent.
+        """
+        arcs = self.heard.shape[1]
+        gone = sp.diags_array(off[:arcs].astype(float))
+        lost = np.asarray((self.heard @ gone).sum(axis=1)).ravel()
+        lost_innovation = np.asarray((self.heard_innovation @ gone).sum(axis=1)).ravel()
+        unpinned = np.where(off[arcs:], self.leader, 0.0)
+        keep = sp.diags_array(1.0 - off[:arcs])
+        return attrs.evolve(
+            self,
+            own=self.own - lost - unpinned,
+            heard=sp.csr_array(self.heard @ keep),
+            leader=self.leader - unpinned,
+            own_innovation=self.own_innovation - lost_innovation,
+            heard_innovation=sp.csr_array(self.heard_innovation @ keep),
+        )
+
+
+@attrs.frozen(eq=False)
+class Decision:
+    """What the controllers make of a communication point.
+
+    Attributes
+    ----------
+    u : (N, p) array
+        Input of each agent.
+    applied : (N, p) array
+        What the controller takes it for: sec(u), or the limited input.
+    memory : (N, k) array
+        At the next communication point.
+    """
+
+    u: Array
+    applied: Array
+    memory: Array
+
+
+class Law(Interface):
+    """The controllers of all agents. Definition only: what they remember is given and returned.
+
+    Attributes
+    ----------
+    weights : Weights
+    extras : tuple of str
+        What an agent measures beside its outputs.
+    """
+
+    weights: Weights
+    extras: tuple[str, ...]
+
+    def start(self, xhat0: Array) -> Array:
+        """Return what the agents remember at the start, (N, k), from their first estimates."""
+
+    def lead(self, s0: Array) -> Array:
+        """Return what the leader remembers, (k,), at the state s0 (m,)."""
+
+    def send(self, memory: Array, measured: Array) -> Array:
+        """Return the message of each agent, (N, w)."""
+
+    def step(
+        self,
+        t: float,
+        h: float,
+        measured: Array,
+        sent: Array,
+        heard: Heard,
+        memory: Array,
+        weights: Weights,
+    ) -> Decision:
+        """Return the inputs from t to t + h [s] and what is remembered there."""
+
+    def leader_message(self, memory: Array) -> Array:
+        """Return what the leader sends, (w,)."""
+
+    def leader_step(self, t: float, h: float, memory: Array) -> Array:
+        """Return what the leader remembers at t + h."""
+
+
+class CompiledLaw(ABC):
+    """What a law needs so that the engine can run it: C sources and the data for them."""
+
+    @abstractmethod
+    def sources(self) -> Sources:
+        """Return the sources of the engine with these controllers.
+
+        Raises
+        ------
+        InputError
+            If they cannot be had in C.
+        """
+
+    @abstractmethod
+    def constants(self, h: float) -> Array:
+        """Return the members of the structure ``Controller`` for a period h [s], in order."""
+
+    @property
+    def own_values(self) -> Array:
+        """The parameters in which agents differ, (N, k)."""
+        return np.zeros((0, 0))
+
+
+class ProtocolLaw(CompiledLaw):
+    """The protocol: input (6), its saturation, and the sampled observer (5) or (22).
+
+    Parameters
+    ----------
+    agent : Agent
+        The model that observers and leader compute with.
+    protocol : Protocol
+
+    Examples
+    --------
+    >>> from posmas_fmi.agent import linear_agent
+    >>> from posmas_fmi.network import network_from_arcs
+    >>> from posmas_fmi.protocol import make_protocol
+    >>> one = network_from_arcs(1, [], pinned=[1])
+    >>> protocol = make_protocol(one, K=[[-1.0]], E=[[0.5]], phi=2.0)
+    >>> law = ProtocolLaw(linear_agent([[-1.0]], [[1.0]], [[1.0]]), protocol)
+    >>> law.send(memory=np.array([[3.0]]), measured=np.array([[4.0]]))
+    array([[3., 1.]])
+    """
+
+    extras: tuple[str, ...] = ()
+
+    def __init__(self, agent: Agent, protocol: Protocol) -> None:
+        self.agent, self.protocol = agent, protocol
+        self.weights = Weights.of(protocol, innovation=agent.q)
+        self._steps: dict[float, Propagator] = {}
+
+    def propagator(self, h: float) -> Propagator:
+        """Return the sampled propagation of the model over h [s]."""
+        if h not in self._steps:
+            self._steps[h] = Propagator.of(self.agent, h)
+        return self._steps[h]
+
+    def sources(self) -> Sources:
+        """Return the sources of the engine; g and sec must be expressions."""
+        from posmas_fmi.cosim.native import engine_sources
+        from posmas_fmi.fmu.positive_agent import functions_header
+
+        agent = self.agent
+        if not isinstance(agent.g, VectorFunction) or not isinstance(agent.sec, VectorFunction):
+            raise InputError(
+                "g and sec are Python functions; the engine needs expressions", "$.scenario.engine"
+            )
+        header = functions_header(agent.g, agent.sec, agent.m, agent.p, agent.q, slopes=False)
+        return engine_sources("protocol", header)
+
+    def constants(self, h: float) -> Array:
+        """Return the members of csrc/protocol/controller.h's structure."""
+        agent, protocol, step = self.agent, self.protocol, self.propagator(h)
+        matrices = (
+            *(protocol.K, protocol.E, agent.B, agent.C, agent.H),
+            *(step.full, step.half, step.gamma, step.half_gamma),
+            *(step.start, step.middle, step.end),
+        )
+        return np.concatenate([[h], *(matrix.ravel() for matrix in matrices)])
+
+    def start(self, xhat0: Array) -> Array:
+        """Return the first estimates: that is all an agent remembers."""
+        return np.array(xhat0)
+
+    def lead(self, s0: Array) -> Array:
+        """Return the leader's state."""
+        return np.array(s0)
+
+    def send(self, memory: Array, measured: Array) -> Array:
+        """Return the estimate and the innovation ``y - C x̂`` of each agent, (N, m + q)."""
+        return np.concatenate([memory, measured - memory @ self.agent.C.T], axis=1)
+
+    def step(
+        self,
+        t: float,
+        h: float,
+        measured: Array,
+        sent: Array,
+        heard: Heard,
+        memory: Array,
+        weights: Weights,
+    ) -> Decision:
+        """Equation (6), and the observer over one communication step."""
+        m = self.agent.m
+        disagreement = weights.disagreement(sent, heard)
+        u = disagreement[:, :m] @ self.protocol.K.T
+        applied = self.agent.sec_numpy(u)
+        held = applied @ self.agent.B.T + disagreement[:, m:] @ self.protocol.E.T
+        return Decision(u, applied, self.propagator(h)(t, memory, held))
+
+    def leader_message(self, memory: Array) -> Array:
+        """Return the state, and no innovation."""
+        return np.concatenate([memory, np.zeros(self.agent.q)])
+
+    def leader_step(self, t: float, h: float, memory: Array) -> Array:
+        """Return the leader's state (3) after one step."""
+        return np.asarray(self.propagator(h)(t, memory[None, :], np.zeros((1, self.agent.m)))[0])
