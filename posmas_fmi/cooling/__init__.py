@@ -4,6 +4,7 @@ The public names are those listed here.
 """
 
 from posmas_fmi.cooling.classes import W_CLASSES, class_limit, class_of, dew_point, exceedance
+from posmas_fmi.cooling.control import CONTROLLERS, Control, controller
 from posmas_fmi.cooling.kpi import KeyFigures, key_figures, rainflow, settling_time, thermal_cycles
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.loads import (
@@ -26,7 +27,9 @@ from posmas_fmi.cooling.plant import header_values, line_values
 from posmas_fmi.cooling.sensor import Sensor
 
 __all__ = [
+    "CONTROLLERS",
     "W_CLASSES",
+    "Control",
     "KeyFigures",
     "LineParameters",
     "LoadModel",
@@ -36,6 +39,7 @@ __all__ = [
     "ValveMapping",
     "class_limit",
     "class_of",
+    "controller",
     "dew_point",
     "exceedance",
     "generate_loads",
