@@ -7,16 +7,18 @@ import os
 import tempfile
 import weakref
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError
+from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, InputError
 from posmas_fmi.fmu.archive import unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
+from posmas_fmi.fmu.units import Conversion, Units
 from posmas_fmi.fmu.variables import Ports, Variable, Variables
 
 
@@ -245,6 +247,27 @@ class FmuFile:
             If there is none; the message names the nearest one.
         """
         return self._variables.resolve(name)[0]
+
+    @cached_property
+    def units(self) -> Units:
+        """The units that the file defines."""
+        return Units.read(self.description)
+
+    def conversion(self, name: str, unit: str) -> Conversion:
+        """Return how a value in that unit becomes one of the variable of that name.
+
+        Raises
+        ------
+        FmuError
+            If there is no such variable.
+        InputError
+            If the units do not fit; see `posmas_fmi.fmu.units.Units.conversion`.
+        """
+        variable = self.variable(name)
+        try:
+            return self.units.conversion(unit, variable.unit, relative=variable.relative)
+        except InputError as error:
+            raise InputError(f"{self.path.name}: {name!r}: {error.message}") from None
 
     def ports(self, names: Iterable[str]) -> Ports:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""

@@ -40,6 +40,8 @@ class Variable:
         Row-major; None where there is none, or not a number.
     unit : str or None
     nominal : float
+    relative : bool
+        Whether it is a difference (``relativeQuantity``).
     """
 
     name: str
@@ -52,6 +54,7 @@ class Variable:
     unit: str | None = None
     nominal: float = 1.0
     description: str = ""
+    relative: bool = False
 
     @classmethod
     def read(cls, source: Any) -> Variable:
@@ -71,6 +74,7 @@ class Variable:
             unit=source.unit or (source.declaredType.unit if source.declaredType else None),
             nominal=float(source.nominal) if source.nominal else 1.0,
             description=source.description or "",
+            relative=source.relativeQuantity in (True, "true"),
         )
 
     @property

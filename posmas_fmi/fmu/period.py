@@ -1,0 +1,126 @@
+"""Which communication periods an FMU allows."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import attrs
+
+from posmas_fmi.fmu.file import FmuFile
+
+_SAME = 1e-9  # relative: periods that are equal but for the rounding of what was written
+
+
+@attrs.frozen
+class Experiment:
+    """What an FMU proposes (DefaultExperiment); None where it says nothing.
+
+    Attributes
+    ----------
+    start, stop, step : float or None
+        [s]; `step` is the communication step size, in Model Exchange that of the solver.
+    tolerance : float or None
+        Relative, of the solver.
+    """
+
+    start: float | None = None
+    stop: float | None = None
+    step: float | None = None
+    tolerance: float | None = None
+
+
+@attrs.frozen
+class PeriodCheck:
+    """Whether a period is allowed.
+
+    Attributes
+    ----------
+    allowed : bool
+    reason : str
+        Why it is not; empty if it is.
+    nearest : float or None
+        The nearest period that is allowed [s].
+    """
+
+    allowed: bool
+    reason: str = ""
+    nearest: float | None = None
+
+
+def default_experiment(file: FmuFile) -> Experiment:
+    """Return what the FMU proposes."""
+    given = file.description.defaultExperiment
+    if given is None:
+        return Experiment()
+    return Experiment(
+        _number(given.startTime),
+        _number(given.stopTime),
+        _number(given.stepSize),
+        _number(given.tolerance),
+    )
+
+
+def check_period(file: FmuFile, period: float, *, last: float | None = None) -> PeriodCheck:
+    """Say whether an FMU allows a communication period.
+
+    Parameters
+    ----------
+    file : FmuFile
+    period : float
+        [s]
+    last : float, optional
+        Length of the last step, where it is shorter [s].
+
+    Returns
+    -------
+    PeriodCheck
+
+    Notes
+    -----
+    Two attributes of the model description restrict it: ``fixedInternalStepSize`` (FMI 3.0), of
+    which a period is a whole multiple, and ``canHandleVariableCommunicationStepSize``, without
+    which all steps have the same length. For a Model Exchange FMU neither holds.
+    """
+    fixed = _number(getattr(_interface(file), "fixedInternalStepSize", None))
+    for length in (period, *(() if last is None else (last,))):
+        if not length > 0:
+            return PeriodCheck(False, f"expected a period > 0 (got {length:g} s)")
+        if fixed and not _multiple(length, fixed):
+            whole = max(1, round(length / fixed))
+            nearest = float(Fraction(repr(fixed)) * whole)
+            return PeriodCheck(
+                False,
+                f"its solver has steps of {fixed:g} s, and {length:g} s is no whole multiple of "
+                f"them; the nearest is {nearest:g} s",
+                nearest,
+            )
+    different = last is not None and abs(last - period) > _SAME * period
+    if different and not allows_steps_of_different_length(file):
+        return PeriodCheck(
+            False,
+            "all of its communication steps have the same length "
+            f"(the last one would take {last:g} s instead of {period:g} s)",
+            period,
+        )
+    return PeriodCheck(True)
+
+
+def allows_steps_of_different_length(file: FmuFile) -> bool:
+    """Return whether the communication step size may change during a run."""
+    interface = _interface(file)
+    return bool(getattr(interface, "canHandleVariableCommunicationStepSize", True))
+
+
+def _interface(file: FmuFile) -> Any:
+    description = file.description
+    return description.coSimulation if file.kind == "Co-Simulation" else description.modelExchange
+
+
+def _multiple(length: float, unit: float) -> bool:
+    ratio = length / unit
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) <= _SAME * ratio
+
+
+def _number(given: Any) -> float | None:
+    return None if given in (None, "") else float(given)

@@ -1,0 +1,74 @@
+"""Which communication periods an FMU allows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fmu_examples import tank_fmu
+from test_fmu_instance import described
+
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.period import (
+    Experiment,
+    allows_steps_of_different_length,
+    check_period,
+    default_experiment,
+)
+
+VARIABLE = b'canHandleVariableCommunicationStepSize="true"'
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fmus")
+
+
+@pytest.fixture
+def fixed(cache: Path, tmp_path: Path) -> Path:
+    """An FMU whose solver has steps of 0.1 s."""
+    new = VARIABLE + b' fixedInternalStepSize="0.1"'
+    return described(tank_fmu(cache, 3), tmp_path / "fixed.fmu", VARIABLE, new)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_any_period_where_nothing_is_said(cache: Path, fmi: int) -> None:
+    with FmuFile(tank_fmu(cache, fmi)) as file:
+        assert check_period(file, 0.0123).allowed
+        assert check_period(file, 0.1, last=0.05).allowed
+        assert default_experiment(file) == Experiment(0.0, 100.0, 1.0, 1e-9)
+        assert not check_period(file, 0.0).allowed
+        assert not check_period(file, float("nan")).allowed
+
+
+@pytest.mark.parametrize("period", [0.1, 0.3, 0.7, 1e4, 0.1 * 3])
+def test_whole_multiples_of_the_internal_step(fixed: Path, period: float) -> None:
+    with FmuFile(fixed) as file:
+        assert check_period(file, period).allowed
+
+
+@pytest.mark.parametrize(
+    ("period", "nearest"), [(0.25, 0.2), (0.05, 0.1), (1e-6, 0.1), (0.36, 0.4), (100.04, 100.0)]
+)
+def test_others_are_refused_with_the_nearest_that_is_not(
+    fixed: Path, period: float, nearest: float
+) -> None:
+    with FmuFile(fixed) as file:
+        check = check_period(file, period)
+        assert not check.allowed
+        assert check.nearest == nearest
+        assert f"the nearest is {nearest:g} s" in check.reason
+        assert not check_period(file, 0.5, last=period).allowed
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_steps_of_the_same_length(cache: Path, tmp_path: Path, fmi: int) -> None:
+    new = VARIABLE.replace(b"true", b"false")
+    path = described(tank_fmu(cache, fmi), tmp_path / "same.fmu", VARIABLE, new)
+    with FmuFile(path) as file:
+        assert not allows_steps_of_different_length(file)
+        assert check_period(file, 0.3).allowed
+        assert check_period(file, 0.3, last=0.1 * 3).allowed
+        check = check_period(file, 0.3, last=0.1)
+        assert not check.allowed
+        assert "all of its communication steps have the same length" in check.reason
