@@ -35,7 +35,13 @@ class Channel:
 
     @classmethod
     def uniform(
-        cls, arcs: int, h: float, delay: float = 0.0, jitter: float = 0.0, loss: float = 0.0
+        cls,
+        arcs: int,
+        h: float,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+        loss: float = 0.0,
+        resolution: float = 0.0,
     ) -> Channel:
         """Every arc alike; delay and jitter [s] are rounded up to communication steps.
 
@@ -52,11 +58,16 @@ class Channel:
         for name, value in (("delay", delay), ("jitter", jitter)):
             if not 0.0 <= value < math.inf:
                 raise InputError(f"expected a time >= 0 s (got {value!r})", f"$.channel.{name}")
+        if not 0.0 <= resolution < math.inf:
+            raise InputError(f"expected a number >= 0 (got {resolution!r})", "$.channel.resolution")
         if not 0.0 <= loss <= 1.0:
             raise InputError(f"expected a probability in [0, 1] (got {loss!r})", "$.channel.loss")
         steps = [math.ceil(round(value / h, 9)) for value in (delay, jitter)]
         return cls(
-            np.full(arcs, steps[0]), np.full(arcs, steps[1]), np.full(arcs, loss, dtype=float)
+            np.full(arcs, steps[0]),
+            np.full(arcs, steps[1]),
+            np.full(arcs, loss, dtype=float),
+            resolution,
         )
 
     @property

@@ -323,7 +323,8 @@ class Engine:
     def _define(self, library: ctypes.CDLL) -> None:
         system, e = self._system, self._e
         network, law, N = system.network, self._law, system.network.N
-        every, period_of = np.unique(system.every, return_inverse=True)
+        # the first is the leader's, who moves at every communication point
+        every, period_of = np.unique(np.append(system.every, 1), return_inverse=True)
         tick = system.clock.period / TICKS_PER_SECOND
         constants = [law.constants(int(steps) * tick) for steps in every]
         if library.engine_controller_size() != constants[0].nbytes:

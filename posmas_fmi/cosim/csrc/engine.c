@@ -161,6 +161,16 @@ static void gather(const Engine *e, const Point *p, int64_t i, double *disagreem
     silence[1] = (double)(from_leader * e->period) / 1e9;
 }
 
+/* Take what arrives for agent i at a point at which it does not act. */
+static void listen(const Engine *e, const Point *p, int64_t i)
+{
+    int64_t age;
+    for (int64_t arc = e->first_arc[i]; arc < e->first_arc[i + 1]; arc++)
+        hear(e, p, arc, e->sender[arc], &age);
+    if (e->leader_arc[i] >= 0)
+        hear(e, p, e->leader_arc[i], e->agents, &age);
+}
+
 /* ---- measuring ------------------------------------------------------------------------------- */
 
 /* A reading at point k, or an exogenous signal there; `row` is that of the signals. */
@@ -413,6 +423,8 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
     for (int64_t i = me->first; i < me->end; i++) {
         if (begins(e, p->k, i))
             control(e, p, i, t);
+        else if (e->held)
+            listen(e, p, i);
         record(e, p, i);
         note_lowest(e, p, i, t);
         if (steps)
