@@ -85,9 +85,10 @@ NETWORK = network_from_arcs(N, [(1, 2), (2, 3), (3, 4), (4, 1), (1, 3)], [1, 3])
 ARCS = NETWORK.adjacency.nnz + 2
 # each agent's d: its signal, plus a little of the shared tank (instance N)
 SHARED = 4 * N  # its y[1]: readings of an agent are y, x, y[2], d
+OF_AGENTS = [(Extra((Term(column(i)), Term(SHARED, 0.3))),) for i in range(N)]
+OF_SHARED = (Extra(()), Extra(tuple(Term(4 * i, 0.1) for i in range(N)), 0.05))
 WIRED = Wiring(
-    tuple((Extra((Term(column(i)), Term(SHARED, 0.3))),) for i in range(N))
-    + ((Extra(()), Extra(tuple(Term(4 * i, 0.1) for i in range(N)), 0.05)),),
+    (*OF_AGENTS, OF_SHARED),
     np.array([[4 * i + 2, column(i)] for i in range(N)], dtype=np.int64),
     recorded=(SHARED, 3, column(1)),
     drive=Table(),
