@@ -2,77 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import open_page, start
 from report_runs import RUNS, example_1
 
 from posmas_fmi.report import write_report
 
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--no-first-run",
-)
 SECTIONS = (
     "verdict", "network", "states", "inputs", "certificate", "gains", "baseline", "provenance",
     "reading",
 )  # fmt: skip
 
 
-def _programs() -> tuple[str, str] | None:
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-    driver = shutil.which("chromedriver")
-    return (browser, driver) if browser and driver else None
-
-
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Chromium; without it CI fails, a developer's machine says what it skips."""
-    programs = _programs()
-    if programs is None:
-        reason = "chromium and chromedriver are needed to check the report in a browser"
-        if os.environ.get("CI"):
-            pytest.fail(reason)
-        pytest.skip(reason)
-    from selenium import webdriver
-    from selenium.webdriver.chrome.options import Options
-    from selenium.webdriver.chrome.service import Service
-
-    options = Options()
-    options.binary_location = programs[0]
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(programs[1]))
-    yield driver
-    driver.quit()
-
-
-def _open(browser: Any, page: Path, width: int) -> list[str]:
-    """Open a page; return the addresses that the browser asked for."""
-    browser.get_log("browser")
-    browser.get_log("performance")
-    browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride",
-        {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False},
-    )
-    browser.get(page.as_uri())
-    messages = [json.loads(e["message"])["message"] for e in browser.get_log("performance")]
-    return [
-        m["params"]["request"]["url"]
-        for m in messages
-        if m["method"] == "Network.requestWillBeSent"
-    ]
+    yield from start(tmp_path_factory.mktemp("profile"))
 
 
 @pytest.fixture(scope="module", params=list(RUNS))
@@ -81,13 +29,13 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_nothing_is_fetched_and_nothing_complains(browser: Any, page: Path) -> None:
-    requests = _open(browser, page, 1280)
+    requests = open_page(browser, page, 1280)
     assert [url for url in requests if not url.startswith("data:")] == [page.as_uri()]
     assert browser.get_log("browser") == []
 
 
 def test_every_section_has_a_heading_and_a_size(browser: Any, page: Path) -> None:
-    _open(browser, page, 1280)
+    open_page(browser, page, 1280)
     for section in SECTIONS:
         element = browser.find_element("id", section)
         assert element.size["height"] > 40, section
@@ -97,7 +45,7 @@ def test_every_section_has_a_heading_and_a_size(browser: Any, page: Path) -> Non
 
 
 def test_every_drawing_is_visible_and_described(browser: Any, page: Path) -> None:
-    _open(browser, page, 1280)
+    open_page(browser, page, 1280)
     plots = browser.find_elements("css selector", "svg.plot")
     assert len(plots) >= 8
     for plot in plots:
@@ -117,7 +65,7 @@ def test_every_drawing_is_visible_and_described(browser: Any, page: Path) -> Non
 
 @pytest.mark.parametrize("width", [1280, 400])
 def test_no_sideways_scrolling(browser: Any, page: Path, width: int) -> None:
-    _open(browser, page, width)
+    open_page(browser, page, width)
     inner, client = browser.execute_script(
         "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
     )
@@ -128,7 +76,7 @@ def test_no_sideways_scrolling(browser: Any, page: Path, width: int) -> None:
 def test_keyboard_reaches_the_contents_first(browser: Any, page: Path) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    _open(browser, page, 1280)
+    open_page(browser, page, 1280)
     browser.find_element("css selector", "body").send_keys(Keys.TAB)
     focused = browser.switch_to.active_element
     assert focused.get_attribute("class") == "skip"
@@ -145,7 +93,7 @@ def test_hostile_names_do_nothing(browser: Any, tmp_path: Path) -> None:
         "a" * 300,
     ]
     page = write_report(example_1(tmp_path, names=names))
-    requests = _open(browser, page, 400)
+    requests = open_page(browser, page, 400)
     assert browser.title == "paper-example-1 – run report"
     assert [url for url in requests if not url.startswith("data:")] == [page.as_uri()]
     assert browser.get_log("browser") == []
@@ -157,6 +105,6 @@ def test_hostile_names_do_nothing(browser: Any, tmp_path: Path) -> None:
 
 
 def test_it_prints(browser: Any, page: Path) -> None:
-    _open(browser, page, 1280)
+    open_page(browser, page, 1280)
     printed = browser.execute_cdp_cmd("Page.printToPDF", {"printBackground": True})
     assert len(printed["data"]) > 20_000

@@ -69,7 +69,7 @@ def state_panel(run: Run, values: Array, k: int, symbol: str, name: str, alt: st
         largest = _largest(values[:, :, k])
         leader = _largest(run.s[:, k])
         _agents(axes, run, values[:, :, k])
-        axes.plot(*_thin(run.time, run.s[:, k]), color=BLACK, lw=1.5, ls=(0, (1.2, 1.2)))
+        axes.plot(*thin(run.time, run.s[:, k]), color=BLACK, lw=1.5, ls=(0, (1.2, 1.2)))
         if largest > 1e3 * max(leader, 1e-300):
             _symlog(axes, leader or 1.0)
         _mark_loss(axes, run)
@@ -171,7 +171,7 @@ def baseline_panel(run: Run, name: str, alt: str) -> str:
         ):
             modulus = np.abs(error).max(axis=(1, 2))
             both.append(modulus)
-            axes.plot(*_thin(run.time, _positive(modulus)), color=colour, ls=dash, label=text)
+            axes.plot(*thin(run.time, _positive(modulus)), color=colour, ls=dash, label=text)
         _log(axes, np.stack(both, axis=1))
         axes.legend(loc="best")
         return to_svg(figure, name, alt)
@@ -216,7 +216,7 @@ def _agents(axes: Axes, run: Run, values: Array, least: float = 0.0) -> None:
         return
     for i in range(run.N):
         colour, dash = line_look(i)
-        time, line = _thin(run.time, values[:, i])
+        time, line = thin(run.time, values[:, i])
         marker = "." if len(run.time) < 3 else None
         axes.plot(time, line, color=colour, ls=DASHES[dash == "dashed"], marker=marker)
         ends = np.flatnonzero(np.isfinite(line))
@@ -235,7 +235,7 @@ def _bands(axes: Axes, run: Run, values: Array, least: float) -> None:
         axes.fill_between(time, low, high, color=SKY, alpha=0.28, lw=0)
         axes.fill_between(time, q1, q3, color=BLUE, alpha=0.35, lw=0)
         axes.plot(time, median, color=BLUE)
-    axes.plot(*_thin(run.time, values[:, run.worst]), color=VERMILION, lw=1.1)
+    axes.plot(*thin(run.time, values[:, run.worst]), color=VERMILION, lw=1.1)
 
 
 def _shown(values: Array) -> Array:
@@ -247,8 +247,8 @@ def _positive(values: Array) -> Array:
     return np.where(values > 0, values, np.nan)
 
 
-def _thin(time: Array, values: Array) -> tuple[Array, Array]:
-    """Keep the lowest and the highest sample of every stretch, so that no peak is lost."""
+def thin(time: Array, values: Array) -> tuple[Array, Array]:
+    """Return the lowest and the highest sample of every stretch, so that no peak is lost."""
     values = _shown(values)
     if len(time) <= MOST_POINTS:
         return time, values

@@ -60,12 +60,14 @@ class Key:
     patch: bool = False
 
 
-def render(run: Run) -> str:
+def render(run: Run, kpis: bool = False) -> str:
     """Return the HTML page of a run.
 
     Parameters
     ----------
     run : Run
+    kpis : bool
+        Whether a page of key figures lies beside, which is then linked.
 
     Returns
     -------
@@ -78,9 +80,11 @@ def render(run: Run) -> str:
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["show"] = show
-    source = resources.files(__package__).joinpath("template.html.j2").read_text(encoding="utf-8")
+    files = resources.files(__package__)
+    source = files.joinpath("template.html.j2").read_text(encoding="utf-8")
     return environment.from_string(source).render(
         run=run,
+        style=_svg(files.joinpath("style.css").read_text(encoding="utf-8")),
         design=run.design,
         summary=run.summary,
         headline=wording.headline(run),
@@ -99,14 +103,15 @@ def render(run: Run) -> str:
         inputs=_inputs(run) if run.time.size else (),
         baseline=_baseline(run) if run.time.size else None,
         baseline_statement=wording.baseline_statement(run),
-        comparison=_comparison(run.summary.comparison),
+        kpis=kpis,
+        comparison=None if kpis else _comparison(run.summary.comparison),
         provenance=tuple(_flat(run.manifest)),
         attachments=tuple(_long_texts(run.manifest)),
     )
 
 
 def _svg(text: str) -> Markup:
-    """Mark as safe what ElementTree has serialised, and so escaped."""
+    """Mark as safe what ElementTree has serialised, and so escaped, and our own style sheet."""
     from markupsafe import Markup
 
     return Markup(text)

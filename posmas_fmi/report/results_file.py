@@ -37,22 +37,7 @@ def read_results(path: Path) -> dict[str, Any]:
     InputError
         If the file is missing, damaged, or not the results of a run.
     """
-    import h5py
-    import xarray
-
-    if not path.is_file():
-        raise InputError(f"the file is missing; {AGAIN}", str(path))
-    try:
-        with h5py.File(path, "r") as file:  # the layers above leave a half-open file behind
-            dict(file.attrs)
-        dataset = xarray.open_dataset(
-            path, engine="h5netcdf", decode_times=False, decode_coords=False
-        )
-    except Exception as error:  # whatever the HDF5 stack raises on a broken file
-        raise InputError(
-            f"expected a NetCDF-4 file (reading it failed: {one_line(error)}); {AGAIN}", str(path)
-        ) from error
-    with dataset:
+    with open_results(path) as dataset:
         try:
             return _signals(dataset, path)
         except InputError:
@@ -63,8 +48,31 @@ def read_results(path: Path) -> dict[str, Any]:
             ) from error
 
 
+def open_results(path: Path) -> Any:
+    """Open the file as an xarray.Dataset, a context manager; nothing is decoded.
+
+    Raises
+    ------
+    InputError
+        If it is missing or not NetCDF-4.
+    """
+    import h5py
+    import xarray
+
+    if not path.is_file():
+        raise InputError(f"the file is missing; {AGAIN}", str(path))
+    try:
+        with h5py.File(path, "r") as file:  # the layers above leave a half-open file behind
+            dict(file.attrs)
+        return xarray.open_dataset(path, engine="h5netcdf", decode_times=False, decode_coords=False)
+    except Exception as error:  # whatever the HDF5 stack raises on a broken file
+        raise InputError(
+            f"expected a NetCDF-4 file (reading it failed: {one_line(error)}); {AGAIN}", str(path)
+        ) from error
+
+
 @attrs.frozen
-class _Rows:
+class Rows:
     """Which samples are read: every ``stride``-th of the first ``count``, and the last one.
 
     The last sample is what the verdict is about, so it is there whatever the stride.
@@ -100,24 +108,24 @@ def _signals(dataset: Any, path: Path) -> dict[str, Any]:
         if name not in dataset.variables:
             found = clean(", ".join(sorted(map(str, dataset.variables))))
             raise InputError(f"expected a variable '{name}' (found {found}); {AGAIN}", str(path))
-    time = np.asarray(_variable(dataset, "time", ("time",), path), dtype=float)
+    time = np.asarray(read_variable(dataset, "time", ("time",), path), dtype=float)
     present = {n: d for n, d in {**_SIGNALS, **_OPTIONAL}.items() if n in dataset.variables}
     largest = max(dataset[name].size for name in present)
-    rows = _Rows(_recorded(time), max(1, math.ceil(largest / LARGEST_VARIABLE)))
-    signals = {n: rows.of(_variable(dataset, n, d, path)) for n, d in present.items()}
+    rows = Rows(recorded(time), max(1, math.ceil(largest / LARGEST_VARIABLE)))
+    signals = {n: rows.of(read_variable(dataset, n, d, path)) for n, d in present.items()}
     filled = np.flatnonzero(~np.all([_blank(signals[n]) for n in ("xhat", "u", "s")], axis=0))
     stop = int(filled[-1]) + 1 if filled.size else 0
     optional = dict.fromkeys(_OPTIONAL) | {
         n: v[:stop] for n, v in signals.items() if n in _OPTIONAL and not np.isnan(v).all()
     }
     sizes = {dim: int(dataset.sizes[dim]) for dim in ("agent", "state", "input", "output")}
-    labels = {dim: _labels(dataset, dim, size) for dim, size in sizes.items()}
+    labels = {dim: read_labels(dataset, dim, size) for dim, size in sizes.items()}
     return {
         **_attributes(dataset),
         "stride": rows.stride,
         "names": labels.pop("agent"),
         "labels": labels,
-        "network": _network(dataset, sizes["agent"], path),
+        "network": read_network(dataset, sizes["agent"], path),
         "time": rows.of(time)[:stop],
         **{n: signals[n][:stop] for n in _SIGNALS},
         **optional,
@@ -139,7 +147,7 @@ def _attributes(dataset: Any) -> dict[str, Any]:
     }
 
 
-def _variable(dataset: Any, name: str, dims: tuple[str, ...], path: Path) -> Any:
+def read_variable(dataset: Any, name: str, dims: tuple[str, ...], path: Path) -> Any:
     """Return a variable, not yet read, with its dimensions in this order."""
     variable = dataset[name]
     if set(variable.dims) != set(dims) or variable.dtype.kind not in "fiub":
@@ -156,7 +164,7 @@ def _blank(values: Array) -> Array:
     return np.asarray(np.isnan(values).all(axis=tuple(range(1, values.ndim))))
 
 
-def _recorded(time: Array) -> int:
+def recorded(time: Array) -> int:
     """Return the number of leading rows whose times are finite and increase."""
     if not time.size or not np.isfinite(time[0]):
         return 0
@@ -164,7 +172,8 @@ def _recorded(time: Array) -> int:
     return int(ends[0]) + 1 if ends.size else len(time)
 
 
-def _labels(dataset: Any, dim: str, count: int) -> tuple[str, ...]:
+def read_labels(dataset: Any, dim: str, count: int) -> tuple[str, ...]:
+    """Return the names along a dimension, numbers from 1 where it has none."""
     if dim not in dataset.variables:
         return tuple(str(k + 1) for k in range(count))
     return tuple(
@@ -173,9 +182,11 @@ def _labels(dataset: Any, dim: str, count: int) -> tuple[str, ...]:
     )
 
 
-def _network(dataset: Any, n: int, path: Path) -> Network:
+def read_network(dataset: Any, n: int, path: Path) -> Network:
+    """Return the digraph with its pinning, as stored beside the signals."""
+
     def read(name: str, dim: str) -> Array:
-        return np.asarray(_variable(dataset, name, (dim,), path), dtype=float)
+        return np.asarray(read_variable(dataset, name, (dim,), path), dtype=float)
 
     source, target = read("arc_from", "arc"), read("arc_to", "arc")
     weighted = "arc_weight" in dataset.variables
