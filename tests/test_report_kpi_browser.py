@@ -75,13 +75,15 @@ def test_the_slider_recolours_the_network_and_is_worked_by_keys(browser, pages):
 
 
 def test_controllers_can_be_chosen_and_practice_stays_beside(browser, pages):
+    from selenium.webdriver.common.keys import Keys
+
     open_page(browser, pages["three"], 1280)
     first, second = browser.find_elements("css selector", ".view")
     assert first.find_element("css selector", ".who").text == "integral"
     assert second.find_element("css selector", ".who").text == "pi"
     before, reading = fills(browser), first.find_element("css selector", ".reading").text
     assert "All inside ±1 K" in reading
-    browser.find_element("css selector", "input[value=proportional]").click()
+    browser.find_element("css selector", "input[value=proportional]").send_keys(Keys.SPACE)
     assert first.find_element("css selector", ".who").text == "proportional"
     assert fills(browser) != before
     assert "outside ±1 K" in first.find_element("css selector", ".reading").text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from posmas_fmi.report.svg import BLACK, BLUE, CYCLE, GREY, ORANGE, SKY, VERMILI
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+Indices = np.ndarray[Any, np.dtype[np.intp]]
 
 PANEL = (5.0, 2.6)  # inches
 MOST_SAMPLES = 360  # of a band
@@ -53,9 +55,9 @@ def band_panel(run: KpiRun, signals: Signals, name: str, alt: str) -> str:
     with look():
         figure, axes = _panel(signals, "deviation [K]")
         scale, _ = time_unit(signals.time)
-        index, blocks = _stretches(len(signals.time))
+        index = _stretches(len(signals.time))
         deviation = np.where(np.isfinite(signals.deviation), signals.deviation, np.nan)
-        low, q1, median, q3, high = _quantiles(deviation, index, blocks)
+        low, q1, median, q3, high = _quantiles(deviation, index)
         time = signals.time[index] / scale
         axes.fill_between(time, low, high, color=SKY, alpha=0.35, lw=0)
         axes.fill_between(time, q1, q3, color=BLUE, alpha=0.35, lw=0)
@@ -106,9 +108,9 @@ def load_panel(signals: Signals, name: str, alt: str) -> str:
     with look():
         figure, axes = _panel(signals, "heat load [kW]")
         scale, _ = time_unit(signals.time)
-        index, blocks = _stretches(len(signals.time))
+        index = _stretches(len(signals.time))
         heat = signals.heat / 1e3
-        low, _, _, _, high = _quantiles(heat, index, blocks)
+        low, _, _, _, high = _quantiles(heat, index)
         time = signals.time[index] / scale
         axes.fill_between(time, low, high, color=ORANGE, alpha=0.3, lw=0)
         axes.plot(*thin(signals.time / scale, heat.mean(axis=1)), color="#8a5a00")
@@ -174,19 +176,18 @@ def _panel(signals: Signals, label: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _stretches(count: int) -> tuple[Array, Array]:
-    """Return where stretches of samples begin, and that again for reduceat."""
-    index = np.unique(np.linspace(0, max(count - 1, 0), MOST_SAMPLES).astype(int))
-    return index[:count], index[:count]
+def _stretches(count: int) -> Indices:
+    """Return where stretches of samples begin."""
+    return np.unique(np.linspace(0, max(count - 1, 0), MOST_SAMPLES).astype(np.intp))[:count]
 
 
-def _quantiles(values: Array, index: Array, blocks: Array) -> tuple[Array, ...]:
+def _quantiles(values: Array, index: Indices) -> tuple[Array, ...]:
     """Extremes over the stretches, so that no peak is lost; quartiles at their first sample."""
     if not len(values):
         return tuple(np.empty(0) for _ in range(5))
     with np.errstate(all="ignore"):
-        low = np.fmin.reduceat(np.fmin.reduce(values, axis=1), blocks)
-        high = np.fmax.reduceat(np.fmax.reduce(values, axis=1), blocks)
+        low = np.fmin.reduceat(np.fmin.reduce(values, axis=1), index)
+        high = np.fmax.reduceat(np.fmax.reduce(values, axis=1), index)
     rows = values[index]
     filled = np.where(np.isnan(rows).all(axis=1)[:, None], 0.0, rows)
     q1, median, q3 = np.nanquantile(filled, (0.25, 0.5, 0.75), axis=1)

@@ -25,7 +25,8 @@ WIDTH, HEIGHT = 640.0, 360.0
 def frames(run: KpiRun) -> tuple[Array, int]:
     """Return the shown times [s], and the index of the worst moment among them."""
     first = _first(run)
-    assert first is not None and first.signals is not None
+    assert first is not None
+    assert first.signals is not None
     time, n = first.signals.time, first.signals.N
     count = int(np.clip(MOST_VALUES // n, 24, MOST_FRAMES))
     chosen = np.unique(np.linspace(0, len(time) - 1, min(count, len(time))).astype(int))
@@ -51,7 +52,7 @@ def palette(steps: int = 65) -> list[str]:
     --------
     >>> colours = palette()
     >>> len(colours), colours[32]
-    (65, '#f6f7f7')
+    (65, '#f6f6f7')
     """
     import matplotlib
 
@@ -72,7 +73,8 @@ def view_data(run: KpiRun, times: Array) -> dict[str, Any]:
         rows = signals.deviation[index]
         coded[controller.name] = base64.b64encode(_coded(rows, limit).tobytes()).decode()
     first = _first(run)
-    assert first is not None and first.signals is not None
+    assert first is not None
+    assert first.signals is not None
     return {
         "times": [round(float(t), 3) for t in times],
         "lines": list(first.signals.names),
@@ -156,7 +158,8 @@ def _digraph(network: Network, names: tuple[str, ...]) -> str:
             f'<g class="line{pinned}"><title>{escape(name)}</title>'
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}"/>'
             f'<path d="{_mark(x, y - 0.62 * radius, 0.3 * radius)}"/>'
-            f'<text x="{x:.1f}" y="{y + 0.42 * radius:.1f}" font-size="{size:.1f}">{label}</text></g>'
+            f'<text x="{x:.1f}" y="{y + 0.42 * radius:.1f}" font-size="{size:.1f}">'
+            f"{label}</text></g>"
         )
     return _svg(parts, width, height)
 
@@ -177,9 +180,11 @@ def _arrow(a: Array, b: Array, radius: float, pin: bool, bend: float) -> str:
     side = np.array([-last[1], last[0]])
     head = [end, end - 7 * last + 3 * side, end - 7 * last - 3 * side]
     tip = "L".join(f"{p[0]:.1f} {p[1]:.1f}" for p in head)
+    kind = "arc pin" if pin else "arc"
+    curve = " ".join(f"{v:.1f}" for v in (*middle, *end))
     return (
-        f'<g class="arc{" pin" if pin else ""}"><path class="shaft" d="M{start[0]:.1f} {start[1]:.1f}'
-        f'Q{middle[0]:.1f} {middle[1]:.1f} {end[0]:.1f} {end[1]:.1f}"/><path class="head" d="M{tip}Z"/></g>'
+        f'<g class="{kind}"><path class="shaft" d="M{start[0]:.1f} {start[1]:.1f}Q{curve}"/>'
+        f'<path class="head" d="M{tip}Z"/></g>'
     )
 
 

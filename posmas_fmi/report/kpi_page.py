@@ -13,6 +13,7 @@ import numpy as np
 
 from posmas_fmi.report import kpi_figures, kpi_network, kpi_wording
 from posmas_fmi.report.kpi_data import Controller, Kpi, KpiRun, alike
+from posmas_fmi.report.network_drawing import MOST_NODES
 from posmas_fmi.report.wording import show
 
 if TYPE_CHECKING:
@@ -164,7 +165,7 @@ def _network(run: KpiRun, drawn: list[Controller]) -> dict[str, Any]:
         "last": len(times) - 1,
         "data": _safe(data.replace("<", "\\u003c").replace("&", "\\u0026")),
         "palette": kpi_network.palette(33),
-        "few": main.signals.N <= kpi_network.MOST_NODES,
+        "few": main.signals.N <= MOST_NODES,
         "N": main.signals.N,
     }
 

@@ -16,11 +16,11 @@ from posmas_fmi.report.kpi_data import Signals
 from posmas_fmi.report.results_file import (
     LARGEST_VARIABLE,
     Rows,
-    read_labels,
     open_results,
+    read_labels,
     read_network,
-    recorded,
     read_variable,
+    recorded,
 )
 
 
