@@ -189,6 +189,7 @@ def _quantiles(values: Array, index: Indices) -> tuple[Array, ...]:
         low = np.fmin.reduceat(np.fmin.reduce(values, axis=1), index)
         high = np.fmax.reduceat(np.fmax.reduce(values, axis=1), index)
     rows = values[index]
-    filled = np.where(np.isnan(rows).all(axis=1)[:, None], 0.0, rows)
+    empty = np.isnan(rows).all(axis=1, keepdims=True)
+    filled = np.where(empty, 0.0, rows)
     q1, median, q3 = np.nanquantile(filled, (0.25, 0.5, 0.75), axis=1)
     return low, q1, median, q3, high
