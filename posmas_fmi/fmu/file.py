@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Literal, Self
 
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, InputError
-from posmas_fmi.fmu.archive import unpack
+from posmas_fmi.fmu.archive import is_file_name, unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
 from posmas_fmi.fmu.instance import FmuInstance
@@ -129,8 +129,8 @@ class FmuFile:
         import fmpy
 
         where = str(self.path)
-        if not identifier.isidentifier():
-            raise ArchiveError(f"the modelIdentifier {identifier!r} is no C identifier", where)
+        if not is_file_name(identifier):
+            raise ArchiveError(f"the modelIdentifier {identifier!r} is no file name", where)
         binaries = fmpy.platform if self.version == 2 else fmpy.platform_tuple
         name = identifier + fmpy.sharedLibraryExtension
         self.library = self.folder / "binaries" / binaries / name
