@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import numpy as np
+import scipy.sparse as sp
 
-from posmas_fmi.cooling.control import LAWS, Control, parameters
+from posmas_fmi.cooling.control import EXTRAS, LAWS, MEMORY, TEAM, Control, parameters
 from posmas_fmi.cooling.exchanger import conductance
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.mapping import valve_mapping
+from posmas_fmi.cooling.plant import FACILITY
+from posmas_fmi.cosim.law import CompiledLaw, Decision, Heard, Weights
+from posmas_fmi.cosim.native import Sources, engine_sources
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.network import Network
 
 START, LAW, FALLBACK, MANUAL = range(4)  # modes
 _NEVER = 1e12  # s
@@ -57,7 +64,8 @@ def own_values(control: Control, degree: Array, pinned: Array, size: Array | flo
     control : Control
     degree : (N,) array
         Sum of the weights of arcs and pin.
-    pinned : (N,) array of bool
+    pinned : (N,) array
+        Positive where the line hears the leader.
     size : (N,) array or float
         Nominal load over that of the nominal line.
     """
@@ -70,7 +78,7 @@ def own_values(control: Control, degree: Array, pinned: Array, size: Array | flo
         size,
         control.opening[0] * whole,
         control.opening[1] * whole,
-        np.asarray(np.asarray(pinned, bool) | control.everyone, float),
+        np.asarray((pinned > 0) | control.everyone, dtype=float),
         np.asarray(degree, float),
         _NEVER * whole,
         _NEVER * whole,
@@ -124,12 +132,21 @@ class LineControllers:
     own : Own
     h : float
         Communication step [s].
+    water : float
+        Facility supply of θ = 0 [K].
     """
 
-    def __init__(self, line: LineParameters, control: Control, own: Own, h: float) -> None:
+    def __init__(
+        self,
+        line: LineParameters,
+        control: Control,
+        own: Own,
+        h: float,
+        water: float = FACILITY,
+    ) -> None:
         self.line, self.control, self.own, self.h = line, control, own, h
         self.valve = valve_mapping(line)
-        self.values = parameters(line, control, h)
+        self.values = parameters(line, control, h, water)
 
     def set_point(self, t: float) -> float:
         """Return the set-point at a time [K above the facility's nominal supply]."""
@@ -287,3 +304,137 @@ class LineControllers:
         after[:3] = c["full"] @ memory[:3] + c["gamma"] @ held
         after[5] = self.set_point(t + self.h)
         return after
+
+
+class CoolingLaw(CompiledLaw):
+    """The cooling controllers as the master runs them; in C where it can, else as stated here.
+
+    Parameters
+    ----------
+    line : LineParameters
+        The nominal line.
+    control : Control
+    network : Network
+        For the law "team" a complete digraph of each team, see `team_network`.
+    size : (N,) array_like or float
+        Nominal load of each line over that of the nominal line.
+    own : Own, optional
+        Instead of what follows from the arguments before.
+    water : float
+        Facility supply of θ = 0 [K].
+
+    Examples
+    --------
+    >>> from posmas_fmi.cooling.control import controller
+    >>> from posmas_fmi.network import network_from_arcs
+    >>> pair = network_from_arcs(2, [(1, 2), (2, 1)], pinned=[1])
+    >>> law = CoolingLaw(LineParameters(), controller("integral"), pair)
+    >>> law.extras, law.constants(5.0).shape
+    (('power', 'valve', 'water'), (71,))
+    """
+
+    extras: tuple[str, ...] = EXTRAS
+
+    def __init__(
+        self,
+        line: LineParameters,
+        control: Control,
+        network: Network,
+        size: Any = 1.0,
+        own: Own | None = None,
+        water: float = FACILITY,
+    ) -> None:
+        self.line, self.control, self.water = line, control, water
+        self.weights = _weights(network, control)
+        degree = network.in_degree + np.where(control.law == "team", 0.0, network.pinning)
+        self.own = own or own_values(control, degree, np.sign(network.pinning), size)
+        self._stated: dict[float, LineControllers] = {}
+
+    def at(self, h: float) -> LineControllers:
+        """Return the controllers for a period [s]."""
+        if h not in self._stated:
+            self._stated[h] = LineControllers(self.line, self.control, self.own, h, self.water)
+        return self._stated[h]
+
+    def set_point(self, t: float) -> float:
+        """Return the set-point at a time [K above the facility's nominal supply]."""
+        return self.at(1.0).set_point(t)
+
+    def sources(self) -> Sources:
+        """Return the sources of the engine."""
+        return engine_sources("cooling", "/* no functions of an agent are needed */\n")
+
+    def constants(self, h: float) -> Array:
+        """Return the members of csrc/cooling/controller.h's structure."""
+        return np.concatenate([value.ravel() for value in self.at(h).values.values()])
+
+    @property
+    def own_values(self) -> Array:
+        """What differs from line to line, (N, 8)."""
+        return self.own.rows()
+
+    def start(self, xhat0: Array) -> Array:
+        """Return what the lines remember at the start."""
+        return start_memory(xhat0, self.at(1.0).set_point(0.0))
+
+    def lead(self, s0: Array) -> Array:
+        """Return what the leader remembers at a state (3,); its set-point is that of t = 0."""
+        memory = np.zeros(MEMORY)
+        memory[:3], memory[5] = s0, self.at(1.0).set_point(0.0)
+        return memory
+
+    def send(self, memory: Array, measured: Array) -> Array:
+        """Return the message of each line."""
+        return messages(self.control, memory, measured)
+
+    def step(
+        self,
+        t: float,
+        h: float,
+        measured: Array,
+        sent: Array,
+        heard: Heard,
+        memory: Array,
+        weights: Weights,
+    ) -> Decision:
+        """Return the inputs of all lines; see `LineControllers.step`."""
+        disagreement = weights.disagreement(sent, heard)
+        return Decision(*self.at(h).step(t, measured, disagreement, heard.silence, memory))
+
+    def leader_message(self, memory: Array) -> Array:
+        """Return the leader's state and its set-point."""
+        return np.append(memory[:3], memory[5])
+
+    def leader_step(self, t: float, h: float, memory: Array) -> Array:
+        """Return what the leader remembers next."""
+        return self.at(h).leader_step(t, memory)
+
+
+def _weights(network: Network, control: Control) -> Weights:
+    """Weights of (6), with L + D, with L - D as printed, or with L alone for teams."""
+    a, n = network.adjacency, network.N
+    pin = {"printed": -1.0, "corrected": 1.0}[control.sign] * network.pinning
+    if control.law == "team":
+        pin = 0.0 * network.pinning
+    by_arc = sp.csr_array((a.data, np.arange(a.nnz), a.indptr), shape=(n, a.nnz))
+    none = sp.csr_array((n, a.nnz))
+    return Weights(network.in_degree + pin, by_arc, pin, np.ones(n), none)
+
+
+def team_network(lines: int, largest: int = TEAM) -> Network:
+    """Return the digraph of teams of equal sizes: complete within each, nothing between them.
+
+    Parameters
+    ----------
+    lines : int
+    largest : int
+        Lines in a team at most.
+
+    Examples
+    --------
+    >>> team_network(40).adjacency.sum(axis=1)[:2]
+    array([19., 19.])
+    """
+    teams = np.array_split(np.arange(lines), -(-lines // largest))
+    blocks = sp.block_diag([np.ones((len(t), len(t))) - np.eye(len(t)) for t in teams])
+    return Network(sp.csr_array(blocks), np.arange(lines) == 0)
