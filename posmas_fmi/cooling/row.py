@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import attrs
@@ -292,7 +293,7 @@ def _wire(
     flows = [Term(of("kv", i), float(row.sizes[i])) for i in range(n)]
     heats = [Term(of("primary_heat_flow", i)) for i in range(n)]
     extras.append((Extra(tuple(flows)), Extra(tuple(heats)), Extra((Term(column(n)),))))
-    sources = {
+    sources: dict[str, Callable[[int], int]] = {
         "power": column,
         "valve": lambda i: of("valve_position", i),
         "water": lambda i: water,

@@ -223,6 +223,7 @@ class _Engine(ctypes.Structure):
         ("extra_bias", _pointer),
         ("drives", _int),
         ("measured_from", _pointer),
+        ("measures_others", _int),
         ("recorded", _pointer),
         ("extra_columns", _int),
         ("sensor_gain", _pointer),
@@ -361,6 +362,7 @@ class Engine:
         self._point("term_weight", wiring.weights)
         self._point("extra_bias", wiring.bias)
         self._point("measured_from", wiring.measured, np.int64)
+        e.measures_others = self._measures_others()
         self._point("recorded", wiring.recorded, np.int64)
         e.extra_columns = len(wiring.recorded)
         e.drives = wiring.drive.columns
@@ -370,6 +372,13 @@ class Engine:
             resolution = np.zeros(shape) if sensors is None else sensors.resolution
             self._point("sensor_resolution", resolution)
         self._noise = sensors if sensors is not None and sensors.noise.any() else None
+
+    def _measures_others(self) -> bool:
+        """Whether agents measure readings of other instances."""
+        sources, at = self._system.wiring.measured, self._plant.reading_at
+        agents = np.arange(len(sources))[:, None]
+        own = (sources >= at[agents]) & (sources < at[agents + 1])
+        return bool(((sources >= 0) & ~own).any())
 
     def _set_weights(self, weights: Weights) -> None:
         """Set how messages count, for the digraph as it now is."""

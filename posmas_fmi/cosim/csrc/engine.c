@@ -25,7 +25,8 @@ typedef struct {
     Engine *e;
     Barrier barrier;
     int64_t gate;                    /* 1: go; 2: there are not enough threads */
-    Signal signals[2][MAX_THREADS];  /* two: a thread can be one point ahead of another */
+    Signal signals[3][MAX_THREADS];  /* two in turn: a thread can be one point ahead of another;
+                                        the third between two points */
 } Team;
 
 /* A thread, its agents, and where it is; all members of a team come to the same k and ended. */
@@ -335,7 +336,8 @@ static void arrived(const Engine *e, const Point *p, int64_t i, Signal *signal)
         return;
     if (e->every[i] != 1)
         copy(memory(e, p->k + 1, i), e->pending + i * MEMORY, MEMORY);
-    send(e, p->k + 1, p->next, p->row + 1, i);
+    if (!e->measures_others)
+        send(e, p->k + 1, p->next, p->row + 1, i);
     if (!within(e, p->k + 1, i))
         signal->diverging = 1;
 }
@@ -398,6 +400,15 @@ static void send_first(const Engine *e, const Member *me, const Point *p, Signal
                                message(e, p->slot, e->agents));
 }
 
+/* Measure and send at k + 1, when the readings of all instances are there. */
+static void send_late(const Engine *e, const Member *me, const Point *p, Signal *signal)
+{
+    *signal = (Signal){0};
+    for (int64_t i = me->first; i < me->end; i++)
+        if (ends(e, p->k, i))
+            send(e, p->k + 1, p->next, p->row + 1, i);
+}
+
 /* Wait for what was posted by this thread. */
 static void wait_for_posted(const Engine *e, const Member *me, const Point *p, int64_t from,
                             int64_t to, Signal *signal)
@@ -457,12 +468,12 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
 }
 
 /* Wait for the others; what any of them says. */
-static Signal meet(Team *team, int64_t k)
+static Signal meet(Team *team, int64_t slot)
 {
     barrier_wait(&team->barrier, team->e->threads);
     Signal all = {0};
     for (int64_t id = 0; id < team->e->threads; id++) {
-        const Signal *one = &team->signals[k & 1][id];
+        const Signal *one = &team->signals[slot][id];
         all.failed |= one->failed;
         all.diverging |= one->diverging;
         all.halt |= one->halt;
@@ -478,17 +489,21 @@ static void run(Member *me)
     Signal all = {0};
     if (e->ready == 0) {
         read_first(e, me, &p, &team->signals[p.k & 1][me->id]);
-        all = meet(team, p.k);
+        all = meet(team, p.k & 1);
     }
     if (e->ready != 1 && !all.failed) {
         send_first(e, me, &p, &team->signals[(p.k + 1) & 1][me->id]);
-        all = meet(team, p.k + 1);
+        all = meet(team, (p.k + 1) & 1);
         me->diverging = all.diverging;
     }
     while (!all.failed && !all.halt && p.k < e->until) {
         const int go = !me->diverging && p.k < e->steps;
         advance(e, me, &p, go, &team->signals[p.k & 1][me->id]);
-        all = meet(team, p.k);
+        all = meet(team, p.k & 1);
+        if (e->measures_others && go && !all.failed) {
+            send_late(e, me, &p, &team->signals[2][me->id]);
+            meet(team, 2);
+        }
         me->k = p.k + 1;
         if (!go) {
             me->ended = me->diverging ? DIVERGED : COMPLETE;

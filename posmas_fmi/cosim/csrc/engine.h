@@ -47,6 +47,7 @@ typedef struct {
     const double *extra_bias;   /* (extras) input = bias + sum of weight * term */
     int64_t drives;             /* columns of `drive` */
     const int64_t *measured_from; /* (agents, MEASURED - Q) as `term`: what is measured beside y */
+    int64_t measures_others;    /* some of it is read from other instances: all are read first */
     const int64_t *recorded;    /* (extra_columns) as `term`: what is recorded besides */
     int64_t extra_columns;
 
