@@ -109,3 +109,30 @@ class FmuCallError(FmuError):
         super().__init__(message, where)
         self.agent = agent
         self.time = time
+
+
+class FmuLostError(FmuCallError):
+    """The process that ran an FMU ended, or did not answer in time.
+
+    Parameters
+    ----------
+    message, where, agent, time
+        As for `FmuCallError`.
+    signal : int, optional
+        That ended it.
+    exit_code : int, optional
+        That it ended with.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        where: str = "",
+        agent: str = "",
+        time: float = 0.0,
+        signal: int | None = None,
+        exit_code: int | None = None,
+    ) -> None:
+        super().__init__(message, where, agent, time)
+        self.signal = signal
+        self.exit_code = exit_code

@@ -101,6 +101,7 @@ class _Fmus(ctypes.Structure):
         ("messages", _pointer),
         ("remote", _pointer),
         ("is_remote", _pointer),
+        ("calling", _pointer),
     )
 
 
@@ -125,6 +126,15 @@ class Report(ctypes.Structure):
 
 _CALLS = ("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep")
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
+DIED, DEADLINE = 8, 9  # of an FMU in another process
+
+
+def call_name(call: int, fmi: int) -> str:
+    """Return the name of the FMI function of a call; empty for none."""
+    name = _CALLS[call] if 0 <= call < len(_CALLS) else ""
+    if name in ("Get", "Set"):
+        name += "Real" if fmi == 2 else "Float64"
+    return name and f"fmi{fmi}{name}"
 
 _KEPT, _LONGEST = 64, 1016
 
@@ -133,7 +143,9 @@ class _Message(ctypes.Structure):
     _fields_ = (("sender", _int), ("text", ctypes.c_char * _LONGEST))
 
 
-class _MessageLog(ctypes.Structure):
+class MessageLog(ctypes.Structure):
+    """The structure of csrc/message_log.h."""
+
     _fields_ = (("written", _int), ("busy", _int), ("message", _Message * _KEPT))
 
 
@@ -148,11 +160,13 @@ class NativeMessages:
     ----------
     library : ctypes.CDLL
         Of `posmas_fmi.cosim.native.fmus_sources`.
+    log : MessageLog, optional
+        Where they are kept; made here by default.
     """
 
-    def __init__(self, library: ctypes.CDLL) -> None:
+    def __init__(self, library: ctypes.CDLL, log: MessageLog | None = None) -> None:
         self._library = library
-        self._log = _MessageLog()
+        self._log = MessageLog() if log is None else log
         self._senders: dict[int, _Sender] = {}
         self._begin: dict[int, int] = {}
 

@@ -63,6 +63,11 @@ def fmus_sources() -> Sources:
     return Sources("fmus", _read(_FMUS))
 
 
+def worker_sources() -> Sources:
+    """Return the sources of the loop over FMUs in worker processes, for both sides of it."""
+    return Sources("worker", _read((*_FMUS, "remote.h", "remote.c", "worker_loop.c")))
+
+
 def engine_sources(kind: str, header: str) -> Sources:
     """Return the sources of the engine for one kind of controller.
 

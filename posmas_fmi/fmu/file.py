@@ -33,6 +33,8 @@ class FmuFile:
         Where the messages of its instances go; kept by Python functions if left out.
     trace : callable, optional
         Called with the name before each call into the binary.
+    unpacked : Path, optional
+        Where somebody has unpacked the archive already, who removes it again.
 
     Attributes
     ----------
@@ -66,15 +68,26 @@ class FmuFile:
     kind = "Co-Simulation"
 
     def __init__(
-        self, path: str | Path, messages: Messages | None = None, trace: Trace | None = None
+        self,
+        path: str | Path,
+        messages: Messages | None = None,
+        trace: Trace | None = None,
+        unpacked: Path | None = None,
     ) -> None:
         self.path = Path(path)
         self._trace = trace
-        folder = tempfile.TemporaryDirectory(prefix="posmas-fmi-", ignore_cleanup_errors=True)
+        folder = None
         try:
-            self._open(Path(folder.name))
+            if unpacked is None:
+                folder = tempfile.TemporaryDirectory(
+                    prefix="posmas-fmi-", ignore_cleanup_errors=True
+                )
+                unpacked = Path(folder.name)
+                unpack(self.path, unpacked)
+            self._open(unpacked)
         except BaseException:
-            folder.cleanup()
+            if folder is not None:
+                folder.cleanup()
             raise
         self._messages = messages or PythonMessages()
         self._live: dict[int, Live] = {}
@@ -86,7 +99,6 @@ class FmuFile:
     def _open(self, folder: Path) -> None:
         import fmpy
 
-        unpack(self.path, folder)
         where = str(self.path)
         try:
             description = fmpy.read_model_description(str(folder), validate=False)
@@ -140,6 +152,10 @@ class FmuFile:
             raise FmuError(
                 f"expected {name} among the binaries for {binaries} (the FMU has {has})", where
             )
+        self._bind(where)
+
+    def _bind(self, where: str) -> None:
+        """Load the library."""
         self._fmu = Binding(self.library, self._binding(), where, self._needed(), self._trace)
         self._functions = self._fmu.functions
         resources = self.folder / "resources"

@@ -35,6 +35,11 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(name)
 
 
+def status_label(status: int) -> str:
+    """Return the standard's name of a status."""
+    return _STATUS[status] if 0 <= status < len(_STATUS) else "outside the standard"
+
+
 class FmuInstance:
     """One Co-Simulation instance; made by `FmuFile.instantiate`.
 
@@ -119,7 +124,7 @@ class FmuInstance:
         messages : iterable of str
             What the instance said during the call.
         """
-        label = _STATUS[status] if 0 <= status < len(_STATUS) else "outside the standard"
+        label = status_label(status)
         return self.error(function, said(f"returned status {status} ({label})", messages))
 
     def _where(self, function: str) -> str:

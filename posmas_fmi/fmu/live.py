@@ -53,10 +53,11 @@ def release(
     instances: dict[int, Live],
     frees: Frees,
     unload: Any,
-    folder: tempfile.TemporaryDirectory[str],
+    folder: tempfile.TemporaryDirectory[str] | None,
 ) -> None:
     """Free all instances, the library and the unpacked files."""
     for key in list(instances):
         free_instance(instances, key, frees)
     unload()
-    folder.cleanup()
+    if folder is not None:
+        folder.cleanup()

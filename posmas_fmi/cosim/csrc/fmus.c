@@ -22,6 +22,16 @@ static int64_t said(const Fmus *f)
     return f->messages ? __atomic_load_n(&f->messages->written, __ATOMIC_ACQUIRE) : 0;
 }
 
+static void begin(const Fmus *f, Call call, int64_t instance)
+{
+    Calling *c = f->calling;
+    if (!c)
+        return;
+    c->call = call;
+    c->instance = instance;
+    __atomic_store_n(&c->begun, c->begun + 1, __ATOMIC_RELEASE);
+}
+
 static int fail(Report *report, Incident incident)
 {
     if (!report->failure.call || incident_before(&incident, &report->failure))
@@ -67,6 +77,7 @@ static int convert(const Fmus *f, const Binding *b, int64_t instance, const doub
     const Ports *p = &b->inputs;
     if (p->partial) {
         const int64_t before = said(f);
+        begin(f, CALL_GET_BEFORE_SET, instance);
         const int status = get(b, f->component[instance], p, values);
         if (status != OK && !odd(status, CALL_GET_BEFORE_SET, instance, before, report))
             return 0;
@@ -88,10 +99,12 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
         inputs = scratch;
     }
     int64_t before = said(f);
+    begin(f, CALL_SET, instance);
     int status = set(b, component, &b->inputs, inputs);
     if (status != OK && !odd(status, CALL_SET, instance, before, report))
         return 0;
     before = said(f);
+    begin(f, CALL_STEP, instance);
     if (b->fmi == 2) {
         status = ((Step2 *)b->do_step)(component, t, h, 0);
         return status == OK || odd(status, CALL_STEP, instance, before, report);
@@ -115,6 +128,7 @@ int fmus_read(const Fmus *f, int64_t instance, double *values, double *scratch, 
     const Ports *p = &b->readings;
     const int direct = !p->places && !p->scale;
     const int64_t before = said(f);
+    begin(f, CALL_GET, instance);
     const int status = get(b, f->component[instance], p, direct ? values : scratch);
     if (status != OK && !odd(status, CALL_GET, instance, before, report))
         return 0;

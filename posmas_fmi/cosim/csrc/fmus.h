@@ -69,6 +69,13 @@ typedef struct {
     int (*read)(void *context, int64_t instance, double *readings, Report *report); /* no step */
 } Remote;
 
+/* What is going on, for another process that watches. */
+typedef struct {
+    int64_t begun;    /* calls so far */
+    int64_t call;     /* one of Call */
+    int64_t instance;
+} Calling;
+
 /* All instances: the agents' first, then those that are no agents. */
 typedef struct {
     int64_t n;
@@ -81,6 +88,7 @@ typedef struct {
     const MessageLog *messages; /* NULL: kept elsewhere */
     const Remote *remote;       /* NULL: none */
     const int64_t *is_remote;   /* of each instance */
+    Calling *calling;           /* is told before each call; NULL: nobody watches */
 } Fmus;
 
 static inline int fmus_is_remote(const Fmus *f, int64_t instance)

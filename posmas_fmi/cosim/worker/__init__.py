@@ -1,0 +1,1 @@
+"""FMUs in worker processes: what they do to their process stays there."""

@@ -1,0 +1,107 @@
+"""The worker processes of a run: how many, and which instance goes where."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Literal
+
+import attrs
+
+from posmas_fmi.cosim.worker.minder import Limits
+from posmas_fmi.cosim.worker.process import Patience, WorkerProcess
+from posmas_fmi.cosim.worker.proxy import RemoteFile
+
+OnFailure = Literal["stop", "freeze", "restart"]
+
+# Looks of about 20 ns each: two wake-ups of a sleeping process cost as much as these.
+SPINS = 2000
+
+
+@attrs.frozen
+class Isolation:
+    """How FMUs are kept apart.
+
+    Attributes
+    ----------
+    mode : {"auto", "process", "none"}
+        Auto: FMUs that this installation has not built run in worker processes.
+    workers : int
+        Number of processes; 0: one for each processor.
+    on_failure : {"stop", "freeze", "restart"}
+        What the rest of the network does when an FMU fails.
+    limits : Limits
+    patience : Patience
+    """
+
+    mode: Literal["auto", "process", "none"] = "none"
+    workers: int = 0
+    on_failure: OnFailure = "stop"
+    limits: Limits = attrs.field(factory=Limits)
+    patience: Patience = attrs.field(factory=Patience)
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class WorkerPool:
+    """Worker processes, started when they are needed.
+
+    Parameters
+    ----------
+    isolation : Isolation
+    instances : int
+        Number of instances that will be placed; no more processes than that are started.
+
+    Attributes
+    ----------
+    spins : int
+        How often master and workers look before they sleep; 0 where processors are short.
+    """
+
+    def __init__(self, isolation: Isolation, instances: int) -> None:
+        self._isolation = isolation
+        cores = processors()
+        self._most = max(1, min(isolation.workers or cores, instances))
+        self.spins = SPINS if cores > 1 else 0
+        self._shared: list[WorkerProcess] = []
+        self._all: list[WorkerProcess] = []
+        self._next = 0
+
+    def __iter__(self) -> Iterator[WorkerProcess]:
+        return iter(self._all)
+
+    def start(self) -> WorkerProcess:
+        """Start one more process."""
+        worker = WorkerProcess(self._isolation.limits, self._isolation.patience, self.spins)
+        self._all.append(worker)
+        return worker
+
+    def place(self, file: RemoteFile) -> WorkerProcess:
+        """Return the process for the next instance of a file."""
+        if file.only_once:
+            return self.start()
+        while len(self._shared) < self._most:  # all at once: they start side by side
+            self._shared.append(self.start())
+        worker = self._shared[self._next % len(self._shared)]
+        self._next += 1
+        return worker
+
+    def drop(self, worker: WorkerProcess) -> None:
+        """End a process that is of no use any more."""
+        worker.close()
+        if worker in self._all:
+            self._all.remove(worker)
+        if worker in self._shared:
+            self._shared.remove(worker)
+
+    def close(self) -> None:
+        """End all processes."""
+        for worker in self._all:
+            worker.close()
+        self._all.clear()
+        self._shared.clear()
