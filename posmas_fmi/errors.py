@@ -120,7 +120,7 @@ class FmuLostError(FmuCallError):
         As for `FmuCallError`.
     signal : int, optional
         That ended it.
-    exit_code : int, optional
+    ended_with : int, optional
         That it ended with.
     """
 
@@ -131,8 +131,8 @@ class FmuLostError(FmuCallError):
         agent: str = "",
         time: float = 0.0,
         signal: int | None = None,
-        exit_code: int | None = None,
+        ended_with: int | None = None,
     ) -> None:
         super().__init__(message, where, agent, time)
         self.signal = signal
-        self.exit_code = exit_code
+        self.ended_with = ended_with

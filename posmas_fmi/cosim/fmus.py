@@ -136,6 +136,7 @@ def call_name(call: int, fmi: int) -> str:
         name += "Real" if fmi == 2 else "Float64"
     return name and f"fmi{fmi}{name}"
 
+
 _KEPT, _LONGEST = 64, 1016
 
 

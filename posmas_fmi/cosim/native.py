@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import tomllib
 from collections.abc import Mapping
 from functools import cache
@@ -143,6 +144,8 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
         If a scenario cannot be read or compiled.
     """
     wanted = [fmus_sources()]
+    if os.name == "posix":
+        wanted.append(worker_sources())
     for file in sorted(models_dir.glob("*.toml")):
         try:
             agent = tomllib.loads(file.read_text(encoding="utf-8")).get("agent")

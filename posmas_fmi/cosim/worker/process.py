@@ -16,7 +16,7 @@ import time
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import attrs
 
@@ -198,7 +198,7 @@ class WorkerProcess:
             elif time.monotonic() - since > patience:
                 self._lose(DEADLINE, patience)
 
-    def _lose(self, why: int, patience: float = 0.0) -> Any:
+    def _lose(self, why: int, patience: float = 0.0) -> NoReturn:
         self.kill(why)
         raise WorkerLost(self.death(patience))
 
@@ -321,5 +321,5 @@ def lost_error(death: Death, fmu: str, instance: str, call: str, time: float) ->
         instance,
         time,
         signal=death.signal,
-        exit_code=death.exit_code,
+        ended_with=death.exit_code,
     )

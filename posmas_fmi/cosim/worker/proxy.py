@@ -15,7 +15,9 @@ from posmas_fmi.cosim.worker.process import WorkerLost, WorkerProcess, lost_erro
 from posmas_fmi.errors import FmuError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.build import cache_folder
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance, FmuState
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.state import FmuState
 from posmas_fmi.fmu.variables import Ports
 
 Place = Callable[["RemoteFile"], WorkerProcess]
@@ -56,7 +58,7 @@ class RemoteFile(FmuFile):
         super().__init__(path)
 
     def _bind(self, where: str) -> None:
-        self._fmu = _NotLoaded()
+        self._fmu: Any = _NotLoaded()
         self._functions = {}
         self._frees: Any = None
 
@@ -113,7 +115,7 @@ class RemoteInstance(FmuInstance):
         self._freed = False
         path = str(self.file.path)
         with _Lost(self):
-            worker.load(path, str(self.file._folder))
+            worker.load(path, str(self.file.folder))
             self.key, _ = worker.request({"do": "instantiate", "path": path, "name": self.name})
 
     def free(self) -> None:
@@ -135,7 +137,7 @@ class RemoteInstance(FmuInstance):
         with _Lost(self):
             return self.worker.request(content, data)
 
-    # ---- the methods of FmuInstance, over there ---------------------------------------------------
+    # ---- the methods of FmuInstance, over there -------------------------------------------------
 
     def initialise(
         self,

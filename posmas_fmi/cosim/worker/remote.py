@@ -261,7 +261,7 @@ class Remote:
         action: Any = "restarted" if restart else "frozen"
         failure = attrs.evolve(failure, action=action, detail="; ".join(notes))
         self.failures.append(failure)
-        _LOG.warning("%s; %s%s", failure, action, notes and f": {failure.detail}" or "")
+        _LOG.warning("%s; %s%s", failure, action, f": {failure.detail}" if notes else "")
 
     def _give_up(self, number: int) -> None:
         self._entries[number].given_up = 1

@@ -170,7 +170,7 @@ class Server:
         return None, b""
 
     def _do_replay(self, request: frames.Frame) -> Answer:
-        """Do steps again, one row of t, h, inputs each, and read; return how many steps went well."""
+        """Do steps again, one row of t, h, inputs each, and read; return how many went well."""
         rows = np.frombuffer(request.data, float)
         number, count = request.content["number"], request.content["steps"]
         loop = ctypes.addressof(self._loop)
@@ -197,7 +197,11 @@ def port_map(facts: dict[str, Any]) -> PortMap:
 
 
 def _facts(error: PosmasError) -> dict[str, Any]:
-    facts = {"kind": type(error).__name__, "message": error.message, "where": error.where}
+    facts: dict[str, Any] = {
+        "kind": type(error).__name__,
+        "message": error.message,
+        "where": error.where,
+    }
     if isinstance(error, FmuCallError):
         facts |= {"agent": error.agent, "time": error.time}
     return facts
