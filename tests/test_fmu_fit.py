@@ -121,11 +121,13 @@ def test_a_plant_away_from_zero_gets_ports_with_offsets(cache: Path, tmp_path: P
     assert made.residual < 1e-9
     scenario = as_scenario(made, tmp_path)
     with make_plant(scenario, fmu_files(scenario)) as plant:
-        np.testing.assert_allclose(plant.outputs(), 0.0, atol=1e-9)
-        np.testing.assert_allclose(plant.states(), 0.0, atol=1e-9)
-        plant.step(0, 0.0, 0.05, np.array([[10.0], [0.0]]))
+        both, readings = np.arange(2), np.full(4, np.nan)  # y and x of two agents
+        plant.read(both, 0.0, readings)
+        np.testing.assert_allclose(readings, 0.0, atol=1e-9)
+        plant.step(both, np.zeros(2), np.full(2, 0.05), np.array([10.0, 0.0]), readings)
+        plant.read(both, 0.05, readings)
         grown = 10 * 0.5 * (1 - np.exp(-0.04 * 0.05))
-        np.testing.assert_allclose(plant.outputs(), [[grown], [0.0]], atol=1e-9)
+        np.testing.assert_allclose(readings, [grown, grown, 0.0, 0.0], atol=1e-9)
 
 
 def test_a_drift_is_kept_and_told(cache: Path) -> None:
