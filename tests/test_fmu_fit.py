@@ -17,7 +17,7 @@ from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import agent_fmu
 from posmas_fmi.fmu.fit import FittedAgent, fit_agent
 from posmas_fmi.scenario import load
-from posmas_fmi.scenario.plant import fmu_files, make_plant
+from posmas_fmi.scenario.plant import fmu_files, make_instances
 
 BOX = {"x": (0.0, 4.0), "u": (-3.0, 3.0), "t": (0.0, 10.0)}
 AROUND = """
@@ -120,7 +120,7 @@ def test_a_plant_away_from_zero_gets_ports_with_offsets(cache: Path, tmp_path: P
     assert (made.g, made.sec, made.notes) == (("0",), ("u1",), ())  # 340 K is its equilibrium
     assert made.residual < 1e-9
     scenario = as_scenario(made, tmp_path)
-    with make_plant(scenario, fmu_files(scenario)) as plant:
+    with make_instances(scenario, fmu_files(scenario)).start() as plant:
         both, readings = np.arange(2), np.full(4, np.nan)  # y and x of two agents
         plant.read(both, 0.0, readings)
         np.testing.assert_allclose(readings, 0.0, atol=1e-9)

@@ -17,16 +17,30 @@ CHUNK = 512  # rows held in memory before they are written
 
 @attrs.frozen
 class Layout:
-    """What the columns of a result are: sizes, names and units."""
+    """What the columns of a result are: sizes, names and units.
+
+    Attributes
+    ----------
+    agents, states, inputs, outputs : tuple of str
+        Labels of the dimensions.
+    of_agents, of_run : tuple of str
+        Further variables with one value for each agent, and with one for all.
+    """
 
     agents: tuple[str, ...]
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    of_agents: tuple[str, ...] = ()
+    of_run: tuple[str, ...] = ()
 
     def shape(self, variable: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
         """Dimensions and sizes of one row of a variable."""
         n, m = len(self.agents), len(self.states)
+        if variable in self.of_agents:
+            return ("agent",), (n,)
+        if variable in self.of_run:
+            return (), ()
         p, q = len(self.inputs), len(self.outputs)
         return {
             "x": (("agent", "state"), (n, m)),

@@ -20,9 +20,12 @@ from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.expression import Array, VectorFunction, parse
 from posmas_fmi.network import Network, network_from_arcs, read_adjacency
 from posmas_fmi.scenario.reading import read_tables
+from posmas_fmi.scenario.signals import Signal, Signals, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
     ChannelTable,
+    ComponentTable,
+    ConnectionTable,
     Count,
     NetworkTable,
     PlantTable,
@@ -55,6 +58,12 @@ class Scenario:
     s0 : (m,) array
     baseline : bool
         Whether the run without control is made as well.
+    components : tuple of ComponentTable
+    connections : tuple of ConnectionTable
+    signals : Signals or None
+        From outside.
+    signal_columns : dict of str to (int, int)
+        First column and number of columns of each signal.
     path : Path
         The file.
     inputs : tuple of Path
@@ -75,6 +84,10 @@ class Scenario:
     xhat0: Array
     s0: Array
     baseline: bool
+    components: tuple[ComponentTable, ...]
+    connections: tuple[ConnectionTable, ...]
+    signals: Signals | None
+    signal_columns: dict[str, tuple[int, int]]
     path: Path
     inputs: tuple[Path, ...]
     text: str
@@ -181,6 +194,16 @@ class _Builder:
             )
             s0 = self.attempt(lambda: _leader(tables.leader.s0, m))
             self.attempt(lambda: make_channel(tables.channel, network, clock.h))
+        self.check_components(network)
+        made: dict[str, Signal] = {}
+        if network and clock:
+            agents = network.N
+            for name, table in tables.signals.items():
+                signal = self.attempt(
+                    lambda n=name, t=table: read_signal(n, t, agents, self.path.parent)  # type: ignore[misc]
+                )
+                if signal is not None:
+                    made[name] = signal
         if self.problems:
             raise ScenarioError(tuple(self.problems), str(self.path))
         assert agent is not None
@@ -205,14 +228,29 @@ class _Builder:
             xhat0=xhat0,
             s0=s0,
             baseline=tables.report.baseline,
+            components=tuple(tables.component),
+            connections=tuple(tables.connection),
+            signals=Signals(tuple(made.values()), clock) if made else None,
+            signal_columns=_columns(made),
             path=self.path,
             inputs=self.inputs(),
             text=self.text,
         )
 
     def inputs(self) -> tuple[Path, ...]:
-        file = self.tables.network.file
-        return () if file is None else (self.path.parent / file,)
+        files = [self.tables.network.file, *(s.file for s in self.tables.signals.values())]
+        return tuple(dict.fromkeys(self.path.parent / f for f in files if f is not None))
+
+    def check_components(self, network: Network | None) -> None:
+        """Names of components must differ from each other and from the agents'."""
+        taken = {"agents", *(network.names if network else ())}
+        for k, table in enumerate(self.tables.component):
+            place = f"$.component[{k}].name"
+            if not table.name or table.name in taken or "." in table.name:
+                self.problems.append(
+                    (place, f"expected a name of its own without a dot (got {table.name!r})")
+                )
+            taken.add(table.name)
 
     def attempt(self, make: Callable[[], T]) -> T | None:
         try:
@@ -233,6 +271,15 @@ class _Builder:
             self.problems.append(("$.scenario.seed", "expected a whole number >= 0"))
         if self.tables.scenario.threads < 1:
             self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
+
+
+def _columns(signals: dict[str, Signal]) -> dict[str, tuple[int, int]]:
+    """First column and number of columns of each signal, side by side."""
+    first, columns = 0, {}
+    for name, signal in signals.items():
+        columns[name] = (first, signal.values.shape[1])
+        first += signal.values.shape[1]
+    return columns
 
 
 def make_agent(table: AgentTable) -> Agent:

@@ -25,7 +25,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
-from posmas_fmi.scenario.plant import fmu_files, make_plant
+from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
 from posmas_fmi.scenario.verdict import summarise
 
 log = logging.getLogger(__name__)
@@ -122,7 +122,8 @@ def run(
 
     designed = make_design_of(scenario)
     files = fmu_files(scenario)
-    system = make_system(scenario, designed)
+    instances = make_instances(scenario, files)
+    system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     _make_folder(folder)
     for name in ("summary.json", "report.html"):
@@ -131,7 +132,7 @@ def run(
     _write_json(folder / "design.json", facts)
     _write_json(folder / "manifest.json", manifest(scenario, files, choice, command))
     began = time.perf_counter()
-    outcome, baseline = _simulate(scenario, designed, files, choice, folder, progress)
+    outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress)
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
@@ -147,7 +148,7 @@ def run(
 def _simulate(
     scenario: Scenario,
     designed: Design,
-    files: list[Path],
+    instances: Instances,
     choice: engine.Choice,
     folder: Path,
     progress: Callable[[str], Progress | None],
@@ -155,23 +156,28 @@ def _simulate(
     """Run with the design, then once more without control for comparison."""
     variables = (*RECORDED, "x_baseline") if scenario.baseline else RECORDED
     with (
-        make_plant(scenario, files) as plant,
-        _recorder(scenario, designed.network, folder / "results.nc", variables) as recorder,
+        instances.start() as plant,
+        _recorder(scenario, designed.network, instances, folder, variables) as recorder,
     ):
-        system = make_system(scenario, designed)
+        system = make_system(scenario, designed, instances)
+        split = instances.recorded
+
+        def record(times: Array, values: dict[str, Array]) -> None:
+            recorder.record_block(times, split.named(values))
+
         outcome = engine.run(
             system,
             plant,
-            recorder.record_block,
+            record,
             progress("simulate"),
             choice,
             scenario.settings.threads,
-            variables=RECORDED,
+            variables=(*RECORDED, "extra"),
         )
         recorder.flush()
         baseline = None
         if scenario.baseline and outcome.ended in ("complete", "diverged"):
-            baseline = _without_control(scenario, designed, files, choice, recorder, progress)
+            baseline = _without_control(scenario, designed, instances, choice, recorder, progress)
         if outcome.ended == "complete":
             recorder.finish()
     return outcome, baseline
@@ -180,7 +186,7 @@ def _simulate(
 def _without_control(
     scenario: Scenario,
     designed: Design,
-    files: list[Path],
+    instances: Instances,
     choice: engine.Choice,
     recorder: Recorder,
     progress: Callable[[str], Progress | None],
@@ -195,9 +201,9 @@ def _without_control(
             rows -= len(block)
             recorder.add({"x_baseline": block})
 
-    with make_plant(scenario, files) as plant:
+    with instances.start() as plant:
         return engine.run(
-            make_system(scenario, uncontrolled),
+            make_system(scenario, uncontrolled, instances),
             plant,
             record,
             progress("without control"),
@@ -207,7 +213,7 @@ def _without_control(
         )
 
 
-def make_system(scenario: Scenario, designed: Design) -> System:
+def make_system(scenario: Scenario, designed: Design, instances: Instances) -> System:
     """Put the definition of the co-simulation together."""
     network = designed.network
     return System(
@@ -230,25 +236,33 @@ def make_system(scenario: Scenario, designed: Design) -> System:
         xhat0=scenario.xhat0,
         s0=scenario.s0,
         seed=scenario.settings.seed,
+        wiring=instances.wiring,
     )
 
 
 def _recorder(
-    scenario: Scenario, network: Network, path: Path, variables: tuple[str, ...]
+    scenario: Scenario,
+    network: Network,
+    instances: Instances,
+    folder: Path,
+    variables: tuple[str, ...],
 ) -> Recorder:
-    agent = scenario.agent
+    agent, recorded = scenario.agent, instances.recorded
     layout = Layout(
         agents=network.names,
         states=tuple(f"x{k + 1}" for k in range(agent.m)),
         inputs=tuple(f"u{k + 1}" for k in range(agent.p)),
         outputs=tuple(f"y{k + 1}" for k in range(agent.q)),
+        of_agents=tuple(recorded.of_agents),
+        of_run=tuple(recorded.of_components),
     )
     attributes = {
         "scenario": scenario.name,
         "period": scenario.clock.h,
         "created_by": f"posmas-fmi {metadata.version('posmas-fmi')}",
     }
-    return Recorder(path, layout, network, variables, attributes)
+    names = (*variables, *layout.of_agents, *layout.of_run)
+    return Recorder(folder / "results.nc", layout, network, names, attributes)
 
 
 def manifest(

@@ -5,40 +5,49 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import attrs
+
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.wiring import Wiring
 from posmas_fmi.errors import ScenarioError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.tables import Port
+from posmas_fmi.scenario.wire import Instance, Recorded, Wires
 
 SHIPPED = "positive_agent"
 
 
 def fmu_files(scenario: Scenario) -> list[Path]:
-    """Return the FMU of each agent; the shipped one is built if it is not there yet."""
+    """Return the FMU of each agent, then of each component; shipped ones are built if need be."""
     plant = scenario.plant
     chosen = [plant.fmu] * scenario.network.N
     for override in plant.override:
         if override.fmu is not None:
             chosen[override.agent - 1] = override.fmu
-    found = {name: _locate(scenario, name) for name in dict.fromkeys(chosen)}
-    return [found[name] for name in chosen]
+    wanted = [(name, plant.fmi, "$.plant.fmu") for name in chosen]
+    wanted += [
+        (component.fmu, component.fmi, f"$.component[{k}].fmu")
+        for k, component in enumerate(scenario.components)
+    ]
+    found = {one: _locate(scenario, *one) for one in dict.fromkeys(wanted)}
+    return [found[one] for one in wanted]
 
 
-def _locate(scenario: Scenario, name: str) -> Path:
+def _locate(scenario: Scenario, name: str, fmi: int, place: str) -> Path:
     if name == SHIPPED:
         return _agent_fmu(scenario)
     plants = shipped_plants()
     if name in plants:
-        return fmu(read_plant(plants[name]), scenario.plant.fmi)
+        return fmu(read_plant(plants[name]), scenario.plant.fmi if fmi not in (2, 3) else fmi)
     path = scenario.path.parent / name
     if not path.is_file():
         raise ScenarioError(
             (
                 (
-                    "$.plant.fmu",
+                    place,
                     f"there is no FMU {name!r} beside the scenario, and none shipped of that name "
                     f"({', '.join(plants)})",
                 ),
@@ -55,36 +64,102 @@ def _agent_fmu(scenario: Scenario) -> Path:
     return agent_fmu(agent.g, agent.sec, agent.m, agent.p, agent.q, fmi=scenario.plant.fmi)
 
 
-def make_plant(scenario: Scenario, files: list[Path]) -> FmuPlant:
-    """Load and initialise the FMUs of a scenario.
+@attrs.frozen(eq=False)
+class Instances:
+    """All instances of a scenario, before they are loaded.
+
+    Attributes
+    ----------
+    specs : tuple of PlantSpec
+        Of the agents, then of the components.
+    wiring : Wiring
+    recorded : Recorded
+        What the columns are that the wiring records.
+    shows_states : bool
+    stop : float
+        End of the run [s].
+    """
+
+    specs: tuple[PlantSpec, ...]
+    wiring: Wiring
+    recorded: Recorded
+    shows_states: bool
+    stop: float
+
+    def start(self) -> FmuPlant:
+        """Load and initialise them.
+
+        Raises
+        ------
+        InputError
+            If ports or parameters do not fit an FMU.
+        FmuError
+            If one cannot be loaded or initialised.
+        """
+        return FmuPlant(self.specs, self.shows_states, self.stop)
+
+
+def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
+    """Put ports, values and wiring of all instances together.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    files : list of Path
+        From `fmu_files`.
 
     Raises
     ------
     InputError
-        If ports or parameters do not fit the FMU.
-    FmuError
-        If it cannot be loaded or initialised.
+        If ports are missing, or what is wired to what is not clear.
     """
-    agent, plant = scenario.agent, scenario.plant
-    given = _shipped_values(scenario) if plant.fmu == SHIPPED else {}
-    specs = []
-    for k, path in enumerate(files):
-        values: dict[str, Any] = dict(plant.parameters)
-        if plant.fmu == SHIPPED:
-            values = {**given, "x": scenario.x0[k], **values}
-        for override in plant.override:
-            if override.agent == k + 1:
-                values |= override.parameters
-        specs.append(PlantSpec(path, values))
-    states = _ports(scenario, "states", agent.m) if _shows_states(scenario) else None
-    return FmuPlant.of_agents(
-        scenario.network.names,
-        specs,
-        _required(scenario, "inputs", agent.p),
-        _required(scenario, "outputs", agent.q),
-        states,
-        stop=scenario.clock.time(scenario.clock.steps),
+    plant, N = scenario.plant, scenario.network.N
+    states = _ports(scenario, "states", scenario.agent.m) if _shows_states(scenario) else None
+    outputs = _required(scenario, "outputs", scenario.agent.q)
+    agents = [
+        Instance(
+            scenario.network.names[k],
+            path,
+            _values(scenario, k),
+            _required(scenario, "inputs", scenario.agent.p),
+            outputs if states is None else outputs + states,
+            plant.tolerance,
+        )
+        for k, path in enumerate(files[:N])
+    ]
+    nothing = PortMap.plain(())
+    components = [
+        Instance(table.name, path, table.parameters, nothing, nothing, table.tolerance)
+        for table, path in zip(scenario.components, files[N:], strict=True)
+    ]
+    signals, first = scenario.signals, scenario.signal_columns
+    wires = Wires(agents, components, first)
+    for k in range(N):
+        wires.exogenous(k, plant.exogenous, "$.plant.exogenous")
+    for k, table in enumerate(scenario.components):
+        wires.exogenous(N + k, table.exogenous, f"$.component[{k}].exogenous")
+    for k, connection in enumerate(scenario.connections):
+        wires.connect(connection, f"$.connection[{k}]")
+    wiring, recorded = wires.wiring(plant.record, [c.record for c in scenario.components], signals)
+    return Instances(
+        tuple(one.spec() for one in (*agents, *components)),
+        wiring,
+        recorded,
+        states is not None,
+        scenario.clock.time(scenario.clock.steps),
     )
+
+
+def _values(scenario: Scenario, k: int) -> dict[str, Any]:
+    """Start values and parameters of agent k."""
+    plant = scenario.plant
+    values: dict[str, Any] = dict(plant.parameters)
+    if plant.fmu == SHIPPED:
+        values = {**_shipped_values(scenario), "x": scenario.x0[k], **values}
+    for override in plant.override:
+        if override.agent == k + 1:
+            values |= override.parameters
+    return values
 
 
 def _shipped_values(scenario: Scenario) -> dict[str, Any]:

@@ -135,6 +135,12 @@ class PlantTable:
         ``u1 = "u[1]"`` or ``u1 = {variable = "u[1]", scale = 1.0, offset = 0.0, unit = "W"}``.
     parameters : table
         Start values by name.
+    exogenous : table
+        FMU input = "name of a signal".
+    record : list of str
+        FMU variables that are recorded besides.
+    tolerance : float, optional
+        Relative, for the solver inside the FMU.
     """
 
     fmu: str = "positive_agent"
@@ -144,6 +150,87 @@ class PlantTable:
     states: dict[str, str | Port] | None = None
     parameters: dict[str, Any] = attrs.field(factory=dict)
     override: list[Override] = attrs.field(factory=list)
+    exogenous: dict[str, str] = attrs.field(factory=dict)
+    record: list[str] = attrs.field(factory=list)
+    tolerance: float | None = None
+
+
+@attrs.frozen
+class SignalTable:
+    """``[signals.NAME]``: a signal from outside, the same for all agents or one for each.
+
+    Attributes
+    ----------
+    value : float, optional
+        Constant, instead of `file`.
+    file : str, optional
+        CSV with a header and the time [s] in its first column.
+    columns : list of str
+        Which columns; one, or one for each agent. Default: all but the time.
+    scale, offset : float
+        Signal = scale × what stands in the file + offset.
+    interpolation : {"hold", "linear"}
+        Between two times of the file. A signal is held over a communication step in any case.
+    """
+
+    value: float | None = None
+    file: str | None = None
+    columns: list[str] = attrs.field(factory=list)
+    scale: float = 1.0
+    offset: float = 0.0
+    interpolation: Literal["hold", "linear"] = "hold"
+
+
+@attrs.frozen
+class ComponentTable:
+    """``[[component]]``: an FMU that is no agent, as a facility that agents share.
+
+    Attributes
+    ----------
+    name : str
+    fmu : str
+        As in ``[plant]``.
+    fmi : int
+        Version of a shipped FMU: 2 or 3.
+    parameters : table
+        Start values by name.
+    exogenous : table
+        FMU input = "name of a signal".
+    record : list of str
+        FMU variables that are recorded.
+    tolerance : float, optional
+        Relative, for the solver inside the FMU.
+    """
+
+    name: str
+    fmu: str
+    fmi: int = 3
+    parameters: dict[str, Any] = attrs.field(factory=dict)
+    exogenous: dict[str, str] = attrs.field(factory=dict)
+    record: list[str] = attrs.field(factory=list)
+    tolerance: float | None = None
+
+
+@attrs.frozen
+class ConnectionTable:
+    """``[[connection]]``: what one FMU shows is an input of another, one communication step later.
+
+    Attributes
+    ----------
+    source, to : str
+        ``"agents.VARIABLE"``, or the name of a component or an agent instead of ``agents``.
+        ``{agent}`` in a variable stands for the agent's number.
+    sum : bool
+        Whether an input is the sum over all agents.
+    scale, offset : float
+        Input = scale × source + offset.
+    """
+
+    source: str
+    to: str
+    sum: bool = False
+    scale: float = 1.0
+    offset: float = 0.0
 
 
 @attrs.frozen
@@ -201,3 +288,6 @@ class ScenarioFile:
     initial: InitialTable = attrs.field(factory=InitialTable)
     channel: ChannelTable = attrs.field(factory=ChannelTable)
     report: ReportTable = attrs.field(factory=ReportTable)
+    signals: dict[str, SignalTable] = attrs.field(factory=dict)
+    component: list[ComponentTable] = attrs.field(factory=list)
+    connection: list[ConnectionTable] = attrs.field(factory=list)

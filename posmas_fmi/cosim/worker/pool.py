@@ -14,8 +14,8 @@ from posmas_fmi.cosim.worker.proxy import RemoteFile
 
 OnFailure = Literal["stop", "freeze", "restart"]
 
-# Looks of about 20 ns each: two wake-ups of a sleeping process cost as much as these.
-SPINS = 2000
+# Looks before sleeping: where master and workers share few processors they cost more than they save.
+SPINS = 0
 
 
 @attrs.frozen

@@ -1,0 +1,253 @@
+"""From the tables of a scenario to instances and their wiring: who is fed by whom."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.cosim.fmu_plant import PlantSpec, PortMap
+from posmas_fmi.cosim.wiring import Extra, NoDrive, Term, Wiring, column
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array
+from posmas_fmi.scenario.signals import Signals
+from posmas_fmi.scenario.tables import ConnectionTable
+
+AGENTS = "agents"
+
+
+@attrs.define(eq=False)
+class Instance:
+    """An instance while its ports are gathered; see `PlantSpec`.
+
+    Attributes
+    ----------
+    name : str
+    fmu : Path
+    values : mapping
+    inputs, readings : PortMap
+        Those of the protocol; more are added.
+    tolerance : float or None
+    extras : dict of str to Extra
+        FMU inputs beside those of the protocol.
+    more : list of str
+        FMU variables that are read besides.
+    """
+
+    name: str
+    fmu: Path
+    values: Mapping[str, Any]
+    inputs: PortMap
+    readings: PortMap
+    tolerance: float | None = None
+    extras: dict[str, Extra] = attrs.field(factory=dict)
+    more: list[str] = attrs.field(factory=list)
+
+    def wants(self, variable: str) -> int:
+        """Place of a variable among the readings, which it is added to if need be."""
+        if variable not in self.more:
+            self.more.append(variable)
+        return len(self.readings.variables) + self.more.index(variable)
+
+    def feed(self, variable: str, extra: Extra, place: str) -> None:
+        """Let an input be what it is wired to.
+
+        Raises
+        ------
+        InputError
+            If it is set by something else already.
+        """
+        if variable in self.extras or variable in self.inputs.variables:
+            raise InputError(f"{self.name}: the input {variable!r} is set twice", place)
+        self.extras[variable] = extra
+
+    def spec(self) -> PlantSpec:
+        """Return the definition of the instance."""
+        return PlantSpec(
+            self.fmu,
+            self.values,
+            self.name,
+            self.inputs + PortMap.plain(tuple(self.extras)),
+            self.readings + PortMap.plain(tuple(self.more)),
+            self.tolerance,
+        )
+
+
+@attrs.frozen(eq=False)
+class Recorded:
+    """What the recorded columns are.
+
+    Attributes
+    ----------
+    of_agents : dict of str to tuple of int
+        Column of each agent, by variable.
+    of_components : dict of str to int
+        Column by ``component.variable``.
+    """
+
+    of_agents: dict[str, tuple[int, ...]] = attrs.field(factory=dict)
+    of_components: dict[str, int] = attrs.field(factory=dict)
+
+    def named(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Give the columns of ``extra``, (r, columns), their names; other arrays stay."""
+        extra = values.get("extra")
+        rest = {name: value for name, value in values.items() if name != "extra"}
+        if extra is None:
+            return rest
+        agents = {name: extra[:, list(at)] for name, at in self.of_agents.items()}
+        return rest | agents | {name: extra[:, at] for name, at in self.of_components.items()}
+
+
+@attrs.frozen
+class _Reading:
+    instance: int
+    variable: str
+
+
+class Wires:
+    """Gathers what is wired to what, and then gives every reading its place.
+
+    Parameters
+    ----------
+    agents, components : list of Instance
+    first_column : mapping of str to (int, int)
+        First column and number of columns of each signal.
+    """
+
+    def __init__(
+        self,
+        agents: list[Instance],
+        components: list[Instance],
+        first_column: Mapping[str, tuple[int, int]],
+    ) -> None:
+        self._agents, self._all = agents, [*agents, *components]
+        self._columns = first_column
+        self._number = {one.name: k for k, one in enumerate(self._all)}
+        self._terms: list[tuple[int, str, list[tuple[_Reading | int, float]], float, str]] = []
+        self._recorded: list[_Reading] = []
+
+    def exogenous(self, instance: int, inputs: Mapping[str, str], place: str) -> None:
+        """Let inputs of an instance follow signals.
+
+        Raises
+        ------
+        InputError
+            If there is no such signal, or it does not say which column is meant.
+        """
+        for variable, signal in inputs.items():
+            where = f"{place}.{variable}"
+            if signal not in self._columns:
+                known = ", ".join(self._columns) or "none"
+                raise InputError(f"there is no signal {signal!r} in [signals] ({known})", where)
+            first, count = self._columns[signal]
+            if count > 1 and instance >= len(self._agents):
+                raise InputError(
+                    f"the signal {signal!r} has {count} columns, one for each agent; a component "
+                    "needs one of a single column",
+                    where,
+                )
+            source = column(first + (instance if count > 1 else 0))
+            self._terms.append((instance, variable, [(source, 1.0)], 0.0, where))
+
+    def connect(self, table: ConnectionTable, place: str) -> None:
+        """Let what some instances show be inputs of others.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown, or it is not clear which goes where.
+        """
+        sources, text = self._end(table.source, f"{place}.source")
+        targets, to = self._end(table.to, f"{place}.to")
+        n = len(self._agents)
+        readings = [_Reading(k, text.replace("{agent}", str(k + 1))) for k in sources]
+        weight = table.scale
+
+        def add(target: int, variable: str, chosen: list[_Reading]) -> None:
+            terms: list[tuple[_Reading | int, float]] = [(r, weight) for r in chosen]
+            self._terms.append((target, variable, terms, table.offset, place))
+
+        if table.sum:
+            if "{agent}" in to:
+                raise InputError("a sum goes to one input: leave {agent} out", f"{place}.to")
+            for target in targets:
+                add(target, to, readings)
+        elif len(sources) == 1:
+            for target in targets:
+                add(target, to.replace("{agent}", str(target + 1)), readings)
+        elif targets == sources:
+            for target, reading in zip(targets, readings, strict=True):
+                add(target, to.replace("{agent}", str(target + 1)), [reading])
+        elif "{agent}" in to:
+            for k, reading in enumerate(readings):
+                add(targets[0], to.replace("{agent}", str(k + 1)), [reading])
+        else:
+            raise InputError(
+                f"this would set one input {n} times; add sum = true, or {{agent}} to the input's "
+                "name",
+                f"{place}.to",
+            )
+
+    def _end(self, text: str, place: str) -> tuple[list[int], str]:
+        name, dot, variable = text.partition(".")
+        if not dot or not variable:
+            raise InputError(f'expected "agents.VARIABLE" or "NAME.VARIABLE" (got {text!r})', place)
+        if name == AGENTS:
+            return list(range(len(self._agents))), variable
+        if name not in self._number:
+            known = ", ".join(one.name for one in self._all[len(self._agents) :]) or "none"
+            raise InputError(
+                f"there is no agent or component {name!r} (components: {known})", place
+            )
+        return [self._number[name]], variable
+
+    def wiring(
+        self,
+        record: list[str],
+        component_record: list[list[str]],
+        signals: Signals | None,
+    ) -> tuple[Wiring, Recorded]:
+        """Give all readings their places; no more can be wired after that.
+
+        Parameters
+        ----------
+        record : list of str
+            Variables of the agents that are recorded.
+        component_record : list of list of str
+            And of each component.
+        signals : Signals, optional
+        """
+        n = len(self._agents)
+        wanted = [_Reading(k, name) for name in record for k in range(n)]
+        of_component = [
+            _Reading(n + k, name) for k, names in enumerate(component_record) for name in names
+        ]
+        recorded = [*wanted, *of_component]
+        local: dict[_Reading, int] = {}
+        in_terms = [s for _, _, terms, _, _ in self._terms for s, _ in terms]
+        for reading in (*recorded, *(s for s in in_terms if isinstance(s, _Reading))):
+            local[reading] = self._all[reading.instance].wants(reading.variable)
+        widths = [len(one.readings.variables) + len(one.more) for one in self._all]
+        at = np.concatenate([[0], np.cumsum(widths)])
+
+        def place(source: _Reading | int) -> int:
+            return source if isinstance(source, int) else int(at[source.instance] + local[source])
+
+        for instance, variable, terms, bias, where in self._terms:
+            extra = Extra(tuple(Term(place(s), w) for s, w in terms), bias)
+            self._all[instance].feed(variable, extra, where)
+        wiring = Wiring(
+            tuple(tuple(one.extras.values()) for one in self._all),
+            np.zeros((n, 0), dtype=np.int64),
+            tuple(place(reading) for reading in recorded),
+            NoDrive() if signals is None else signals,
+        )
+        of_agents = {name: tuple(range(k * n, (k + 1) * n)) for k, name in enumerate(record)}
+        of_components = {
+            f"{self._all[r.instance].name}.{r.variable}": len(wanted) + k
+            for k, r in enumerate(of_component)
+        }
+        return wiring, Recorded(of_agents, of_components)

@@ -1,0 +1,157 @@
+"""Signals, shared FMUs and connections in a scenario file, with real FMUs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posmas_fmi import load, run
+from posmas_fmi.errors import InputError, ScenarioError
+
+ROW = """
+[scenario]
+name = "row"
+until = 60.0
+period = 5.0
+tolerance = 100.0
+
+[agent]
+A = [[-0.1]]
+B = [[0.1]]
+C = [[1.0]]
+
+[network]
+agents = 3
+arcs = [[1, 2], [2, 3], [3, 1]]
+pinned = [1]
+
+[design]
+method = "gains"
+K = [[0.0]]
+E = [[0.01]]
+
+[plant]
+fmu = "cooling_line"
+inputs = {u1 = {variable = "valve", scale = 0.01, offset = 0.7}}
+outputs = {y1 = {variable = "supply_temperature", offset = 305.15}}
+exogenous = {heat_load = "load"}
+record = ["heat_load", "header", "kv"]
+
+[leader]
+s0 = [5.0]
+
+[signals.load]
+file = "loads.csv"
+scale = 1e3
+
+[signals.wet_bulb]
+value = 293.15
+
+[[component]]
+name = "facility"
+fmu = "facility_header"
+parameters = {resistance = 1.0}
+exogenous = {wet_bulb = "wet_bulb"}
+record = ["header", "kv[2]", "heat"]
+
+[[connection]]
+source = "agents.kv"
+to = "facility.kv[{agent}]"
+
+[[connection]]
+source = "agents.primary_heat_flow"
+to = "facility.heat"
+sum = true
+
+[[connection]]
+source = "facility.header"
+to = "agents.header"
+
+[report]
+baseline = false
+"""
+LOADS = "time,a,b,c\n0,80,70,90\n22,100,70,60\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "loads.csv").write_text(LOADS)
+    return tmp_path
+
+
+def write(folder: Path, *changes: tuple[str, str]) -> str:
+    text = ROW
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "row.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_row_of_lines_shares_its_facility(folder: Path) -> None:
+    import xarray
+
+    result = run(load(write(folder)), folder / "out", report=False)
+    assert result.summary["verdict"] in ("converged", "not converged")
+    with xarray.open_dataset(folder / "out" / "results.nc") as data:
+        assert data["heat_load"].dims == ("time", "agent")
+        # what an FMU shows at t was set for the step that ended there: 22 s is seen from 25 s on
+        np.testing.assert_allclose(data["heat_load"][1], [80e3, 70e3, 90e3])
+        np.testing.assert_allclose(data["heat_load"][5], [80e3, 70e3, 90e3])
+        np.testing.assert_allclose(data["heat_load"][6], [100e3, 70e3, 60e3])
+        header, kv = data["facility.header"].values, data["kv"].values
+        assert data["facility.header"].dims == ("time",)
+        np.testing.assert_array_equal(data["header"][1:, 0], header[:-1])
+        np.testing.assert_array_equal(data["facility.kv[2]"][1:], kv[:-1, 1])
+        assert np.ptp(header) > 1e-3
+
+
+WRONG = {
+    "signal": (('heat_load = "load"', 'heat_load = "loads"'), "$.plant.exogenous.heat_load"),
+    "column": (("scale = 1e3", 'columns = ["a", "d", "c"]'), "$.signals.load.columns"),
+    "count": (("scale = 1e3", 'columns = ["a", "b"]'), "$.signals.load.columns"),
+    "both": (("value = 293.15", 'value = 1.0\nfile = "loads.csv"'), "$.signals.wet_bulb"),
+    "component": (('"facility.header"', '"facilty.header"'), "$.connection[2].source"),
+    "no sum": (("sum = true", "sum = false"), "$.connection[1].to"),
+    "twice": (('to = "agents.header"', 'to = "agents.heat_load"'), "$.connection[2]"),
+    "name": (('name = "facility"', 'name = "agents"'), "$.component[0].name"),
+    "FMU": (('fmu = "facility_header"', 'fmu = "header"'), "$.component[0].fmu"),
+    "for one": (
+        ('wet_bulb = "wet_bulb"', 'wet_bulb = "load"'),
+        "$.component[0].exogenous.wet_bulb",
+    ),
+    "variable": (('record = ["heat_load", "header"', 'record = ["heat", "header"'), "cooling_line"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_mistakes_name_their_place(name: str, folder: Path) -> None:
+    change, place = WRONG[name]
+    with pytest.raises((InputError, ScenarioError)) as caught:
+        run(load(write(folder, change)), folder / "out", report=False)
+    assert place in str(caught.value)
+
+
+BAD_FILES = {
+    "gap": ("time,a\n0,1\n5,\n", "line 3"),
+    "not finite": ("time,a\n0,1\n5,nan\n", "line 3: a is not finite"),
+    "order": ("time,a\n0,1\n5,2\n4,3\n", "line 4: expected increasing times"),
+    "short row": ("time,a\n0\n", "line 2"),
+    "empty": ("", "expected a header"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_of_signals_name_the_line(name: str, folder: Path) -> None:
+    text, message = BAD_FILES[name]
+    (folder / "loads.csv").write_text(text)
+    with pytest.raises((InputError, ScenarioError), match=message):
+        load(write(folder))
+
+
+def test_a_missing_file_of_a_signal(folder: Path) -> None:
+    with pytest.raises((InputError, ScenarioError), match=r"no file 'other\.csv'"):
+        load(write(folder, ('file = "loads.csv"', 'file = "other.csv"')))
