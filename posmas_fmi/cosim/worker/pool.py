@@ -14,7 +14,7 @@ from posmas_fmi.cosim.worker.proxy import RemoteFile
 
 OnFailure = Literal["stop", "freeze", "restart"]
 
-# Looks before sleeping: where master and workers share few processors they cost more than they save.
+# Looks before sleeping; with few processors they cost more than they save.
 SPINS = 0
 
 
