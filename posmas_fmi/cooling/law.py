@@ -330,7 +330,7 @@ class CoolingLaw(CompiledLaw):
     >>> pair = network_from_arcs(2, [(1, 2), (2, 1)], pinned=[1])
     >>> law = CoolingLaw(LineParameters(), controller("integral"), pair)
     >>> law.extras, law.constants(5.0).shape
-    (('power', 'valve', 'water'), (71,))
+    (('power', 'valve', 'water'), (65,))
     """
 
     extras: tuple[str, ...] = EXTRAS
