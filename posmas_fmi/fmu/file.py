@@ -289,5 +289,5 @@ class FmuFile:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""
         key = tuple(names)
         if key not in self._known_ports:
-            self._known_ports[key] = self._variables.ports(key)
+            self._known_ports[key] = self._variables.ports(key, self.version)
         return self._known_ports[key]

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,12 +19,14 @@ from posmas_fmi.expression import Array
 from posmas_fmi.fmu.callbacks import said
 from posmas_fmi.fmu.live import free_instance
 from posmas_fmi.fmu.state import FmuState
-from posmas_fmi.fmu.variables import WHOLE, Ports, Variable, pointer
+from posmas_fmi.fmu.variables import WHOLE, Group, Ports, Variable, pointer
 
 if TYPE_CHECKING:
     from posmas_fmi.fmu.file import FmuFile as FmuFile
 
 _LOG = logging.getLogger(__name__)
+_MOST_RETURNS = 100_000  # before the end of one step
+_SAME = 1e-9  # of a step: times that are the same
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
 
@@ -38,6 +41,22 @@ def __getattr__(name: str) -> Any:
 def status_label(status: int) -> str:
     """Return the standard's name of a status."""
     return _STATUS[status] if 0 <= status < len(_STATUS) else "outside the standard"
+
+
+@attrs.frozen
+class Step:
+    """Where one call of DoStep ended.
+
+    Attributes
+    ----------
+    reached : float
+        [s]
+    early : bool
+        Whether that is before the end that was asked for.
+    """
+
+    reached: float
+    early: bool = False
 
 
 class FmuInstance:
@@ -198,21 +217,40 @@ class FmuInstance:
     def do_step(self, time: float, step: float) -> None:
         """Advance from `time` by `step` [s].
 
+        Where the FMU returns before the end, the step is continued to its end.
+
         Raises
         ------
         FmuCallError
-            Also if the FMU ends the step early or asks to end the simulation.
+            Also if the FMU asks to end the simulation.
+        """
+        end, now, length = time + step, time, step
+        for _ in range(_MOST_RETURNS):
+            done = self.step_once(now, length)
+            if not done.early or done.reached >= end - _SAME * step:
+                self.time = end
+                return
+            now, length = done.reached, end - done.reached
+        raise self.error("DoStep", f"returned early {_MOST_RETURNS} times, at last at {now!r} s")
+
+    def step_once(self, time: float, step: float) -> Step:
+        """Call DoStep once.
+
+        Raises
+        ------
+        FmuCallError
+            Also if the FMU asks to end the simulation.
         """
         if self.file.version == 2:
             self._call("DoStep", time, step, 0)
-        else:
-            event, terminate, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
-            last = ctypes.c_double()
-            by = ctypes.byref
-            self._call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
-            if terminate.value or early.value:
-                raise self.ended_early(terminate.value, last.value)
-        self.time = time + step
+            return Step(time + step)
+        event, terminate, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
+        last = ctypes.c_double(time)
+        by = ctypes.byref
+        self._call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
+        if terminate.value:
+            raise self.ended_early(True, last.value)
+        return Step(last.value if early.value else time + step, early.value)
 
     def terminate(self) -> None:
         """End the simulation; values may still be read."""
@@ -234,7 +272,7 @@ class FmuInstance:
             Also if a value is not finite.
         """
         values = np.empty(ports.size)
-        self._exchange("Get", ports, values)
+        self.read_whole(ports, values)
         chosen: Array = values[ports.places]
         if not np.isfinite(chosen).all():
             k = int(np.flatnonzero(~np.isfinite(chosen))[0])
@@ -250,25 +288,49 @@ class FmuInstance:
         if ports.partial:  # the other elements of these arrays stay as they are
             self._exchange("Get", ports, whole)
         whole[ports.places] = given
-        self._exchange("Set", ports, whole)
+        self.write_whole(ports, whole)
+
+    def read_whole(self, ports: Ports, values: Array) -> None:
+        """Read all values that the calls for the ports exchange, (ports.size,)."""
+        self._exchange("Get", ports, values)
+
+    def write_whole(self, ports: Ports, values: Array) -> None:
+        """Set all values that the calls for the ports exchange, (ports.size,)."""
+        self._exchange("Set", ports, values)
 
     def _exchange(self, direction: str, ports: Ports, values: Array) -> None:
-        arguments = [ports.references, len(ports.references), pointer(values)]
-        if self.file.version == 3:
-            arguments.append(ports.size)
-        self._call(direction + self._real, *arguments)
+        begin = 0
+        for group in ports.groups:
+            part = values[begin : begin + group.size]
+            if direction == "Set":
+                self._transfer("Set", group, group.encode(part, self.name))
+            elif group.dtype == float:
+                self._transfer("Get", group, part)
+            else:
+                typed = np.empty(group.size, group.dtype)
+                self._transfer("Get", group, typed)
+                part[:] = typed
+            begin += group.size
+
+    def _transfer(self, direction: str, group: Group, values: np.ndarray[Any, Any]) -> None:
+        count = (group.size,) if self.file.version == 3 else ()
+        references = group.references
+        self._call(direction + group.kind, references, len(references), pointer(values), *count)
 
     def get(self, name: str) -> Any:
-        """Return a value by name: a float, an int, or an array of the variable's shape."""
+        """Return a value by name: a float, an int, a str, or an array of the variable's shape."""
         variable, index = self.file._variables.resolve(name)
+        if variable.type == "String":
+            return self._get_text(variable)
         if variable.type in WHOLE:
-            return self._whole("Get", variable, 0)
+            whole = self._whole(variable)
+            return whole if index is None and variable.shape else int(whole.flat[index or 0])
         values = self.read(self.file.ports((name,)))
         if index is not None or not variable.shape:
             return float(values[0])
         return values.reshape(variable.shape)
 
-    def set(self, values: Mapping[str, ArrayLike]) -> None:
+    def set(self, values: Mapping[str, Any]) -> None:
         """Set values by name: scalars, elements (``u[1]``) or whole arrays, also flattened.
 
         Raises
@@ -276,33 +338,41 @@ class FmuInstance:
         FmuError
             If a name is unknown or a shape wrong.
         """
-        real: dict[str, Array] = {}  # all in one call
+        given: dict[str, Array] = {}  # those that are no texts, in few calls
         for name, value in values.items():
             variable, index = self.file._variables.resolve(name)
-            if variable.type in WHOLE:
-                self._whole("Set", variable, int(np.asarray(value)))
+            if variable.type == "String":
+                self._set_text(variable, value)
                 continue
-            given = np.asarray(value, dtype=float)
+            array = np.asarray(value, dtype=float)
             shape = () if index is not None else variable.shape
-            if given.shape != shape and given.shape != (math.prod(shape),):
-                raise FmuError(f"expected {name!r} of shape {shape} (got {given.shape})", self.name)
-            real[name] = given.reshape(-1)
-        if real:
-            self.write(self.file.ports(real), np.concatenate(list(real.values())))
+            if array.shape != shape and array.shape != (math.prod(shape),):
+                raise FmuError(f"expected {name!r} of shape {shape} (got {array.shape})", self.name)
+            if variable.type in WHOLE and not (array == np.rint(array)).all():
+                raise FmuError(f"expected whole numbers for {name!r} (got {value!r})", self.name)
+            given[name] = array.reshape(-1)
+        if given:
+            self.write(self.file.ports(given), np.concatenate(list(given.values())))
 
-    def _whole(self, direction: str, variable: Variable, value: int) -> int:
-        """Get or set an integer, Boolean or enumeration."""
-        if variable.size != 1:
-            raise FmuError(f"arrays of {variable.type} are not supported", variable.name)
-        kind = variable.type
-        if kind == "Enumeration":
-            kind = "Integer" if self.file.version == 2 else "Int64"
-        name = {"Integer": "c_int", "Boolean": "c_bool"}.get(kind, f"c_{kind.lower()}")
-        ctype = ctypes.c_int if self.file.version == 2 else getattr(ctypes, name)
-        one = (ctype * 1)(value)
+    def _whole(self, variable: Variable) -> np.ndarray[Any, Any]:
+        """Read integers without going through floats."""
+        ports = self.file.ports((variable.name,))
+        typed = np.empty(ports.size, ports.groups[0].dtype)
+        self._transfer("Get", ports.groups[0], typed)
+        return typed.reshape(variable.shape)
+
+    def _get_text(self, variable: Variable) -> str:
+        found = (ctypes.c_char_p * 1)()
         count = (1,) if self.file.version == 3 else ()
-        self._call(direction + kind, (ctypes.c_uint * 1)(variable.reference), 1, one, *count)
-        return int(one[0])
+        self._call("GetString", (ctypes.c_uint * 1)(variable.reference), 1, found, *count)
+        return (found[0] or b"").decode("utf-8", "replace")
+
+    def _set_text(self, variable: Variable, value: Any) -> None:
+        if not isinstance(value, str) or variable.size != 1:
+            raise FmuError(f"expected a text for {variable.name!r} (got {value!r})", self.name)
+        texts = (ctypes.c_char_p * 1)(value.encode())
+        count = (1,) if self.file.version == 3 else ()
+        self._call("SetString", (ctypes.c_uint * 1)(variable.reference), 1, texts, *count)
 
     # ---- state ----------------------------------------------------------------------------------
 

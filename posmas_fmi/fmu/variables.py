@@ -16,11 +16,12 @@ from posmas_fmi.errors import FmuError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.model import element_names
 
-REAL = frozenset({"Real", "Float64"})
+REAL = frozenset({"Real", "Float64", "Float32"})
 WHOLE = frozenset(
     {"Integer", "Boolean", "Enumeration"}
     | {f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)}
 )
+_DOUBLES = {2: "Real", 3: "Float64"}
 _LARGEST_NAMED = 100_000  # elements of an array that can be called by name
 
 
@@ -42,6 +43,10 @@ class Variable:
     nominal : float
     relative : bool
         Whether it is a difference (``relativeQuantity``).
+    lengths : tuple of (int or str)
+        Of each dimension; a name is that of the structural parameter that says it.
+    text : str or None
+        Start value of a variable that is no number.
     """
 
     name: str
@@ -55,6 +60,8 @@ class Variable:
     nominal: float = 1.0
     description: str = ""
     relative: bool = False
+    lengths: tuple[int | str, ...] = ()
+    text: str | None = None
 
     @classmethod
     def read(cls, source: Any) -> Variable:
@@ -75,12 +82,77 @@ class Variable:
             nominal=float(source.nominal) if source.nominal else 1.0,
             description=source.description or "",
             relative=source.relativeQuantity in (True, "true"),
+            lengths=tuple(
+                d.variable.name if d.variable is not None else int(d.start)
+                for d in source.dimensions or ()
+            ),
+            text=source.start if source.type == "String" else None,
         )
 
     @property
     def size(self) -> int:
         """Number of elements."""
         return math.prod(self.shape)
+
+
+@attrs.frozen(eq=False)
+class Group:
+    """Variables of one type, exchanged in one call.
+
+    Attributes
+    ----------
+    kind : str
+        End of the function's name: ``Real``, ``Float64``, ``Int32``, ``Boolean``.
+    dtype : numpy dtype
+        Of the values in the call.
+    references : ctypes array of unsigned int
+        Value reference of each variable.
+    size : int
+        Number of values.
+    """
+
+    kind: str
+    dtype: np.dtype[Any]
+    references: ctypes.Array[ctypes.c_uint]
+    size: int
+
+    def encode(self, values: Array, where: str) -> np.ndarray[Any, Any]:
+        """Return numbers as the call takes them: whole ones rounded, Booleans true from 0.5.
+
+        Raises
+        ------
+        FmuError
+            If one is not finite or out of range.
+        """
+        if self.dtype == float:
+            return np.ascontiguousarray(values, dtype=float)
+        if self.kind == "Float32":
+            return np.ascontiguousarray(values, dtype=self.dtype)
+        if not np.isfinite(values).all():
+            raise FmuError(f"expected finite values for variables of type {self.kind}", where)
+        if self.kind == "Boolean":
+            return np.ascontiguousarray(values >= 0.5, dtype=self.dtype)
+        rounded, limits = np.rint(values), np.iinfo(self.dtype)
+        outside = (rounded < float(limits.min)) | (rounded > float(limits.max))
+        if outside.any():
+            raise FmuError(
+                f"expected values of type {self.kind} from {limits.min} to {limits.max} "
+                f"(got {rounded[outside][0]:g})",
+                where,
+            )
+        return np.ascontiguousarray(rounded, dtype=self.dtype)
+
+
+def kind_of(variable: Variable, version: int) -> tuple[str, np.dtype[Any]]:
+    """Return by which function, and as which type, the values of a variable are exchanged."""
+    kind = variable.type
+    if kind == "Enumeration":
+        kind = "Integer" if version == 2 else "Int64"
+    if kind in ("Real", "Float64"):
+        return kind, np.dtype(float)
+    if version == 2:
+        return kind, np.dtype(np.int32)
+    return kind, np.dtype(bool if kind == "Boolean" else kind.lower())
 
 
 @attrs.frozen(eq=False)
@@ -91,16 +163,16 @@ class Ports:
     ----------
     names : tuple of str
         Variables or elements (``u[1]``) in the order of the values.
-    references : ctypes array of unsigned int
-        Value reference of each variable touched.
+    groups : tuple of Group
+        One call each; their values follow one another.
     size : int
-        Number of values that a call exchanges.
+        Number of values that the calls exchange.
     places : (n,) int array
         Where among those the named values stand.
     """
 
     names: tuple[str, ...]
-    references: ctypes.Array[ctypes.c_uint]
+    groups: tuple[Group, ...]
     size: int
     places: np.ndarray[Any, np.dtype[np.intp]]
 
@@ -108,6 +180,25 @@ class Ports:
     def partial(self) -> bool:
         """Whether some elements of the variables touched are not named."""
         return len(set(self.places.tolist())) < self.size
+
+    @property
+    def plain(self) -> bool:
+        """Whether all are doubles, which one call exchanges."""
+        return all(group.dtype == float for group in self.groups)
+
+    @property
+    def references(self) -> ctypes.Array[ctypes.c_uint]:
+        """Value references, where all are doubles.
+
+        Raises
+        ------
+        FmuError
+            If they are not: such ports are read and written by `FmuInstance.read` and `write`.
+        """
+        if not self.plain:
+            raise FmuError(f"expected ports that are doubles (got {', '.join(self.names)})")
+        (group,) = self.groups
+        return group.references
 
 
 @attrs.frozen(slots=False, eq=False)
@@ -150,38 +241,51 @@ class Variables:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise FmuError(f"there is no variable {name!r}{hint}", self.where)
 
-    def ports(self, names: Iterable[str]) -> Ports:
-        """Resolve names of real variables or of elements of arrays (``u[1]``).
+    def ports(self, names: Iterable[str], version: int) -> Ports:
+        """Resolve names of variables that are numbers, or of elements of arrays (``u[1]``).
 
-        An array's name stands for all of its elements.
+        An array's name stands for all of its elements. Integers, Booleans (0 and 1) and
+        enumerations are numbers as well.
 
         Raises
         ------
         FmuError
-            If there is no such variable, or it is not real.
+            If there is no such variable, or it is no number.
         """
-        resolved: list[str] = []
-        first: dict[int, int] = {}  # value reference -> place of its first value
-        places: list[int] = []
+        asked = [(name, *self.resolve(name)) for name in names]
+        touched: dict[tuple[str, int], Variable] = {}  # by kind and reference
+        for name, variable, _ in asked:
+            if variable.type not in REAL | WHOLE:
+                raise FmuError(
+                    f"expected {name!r} to be a number (it is {variable.type})", self.where
+                )
+            touched.setdefault((kind_of(variable, version)[0], variable.reference), variable)
+        first: dict[tuple[str, int], int] = {}  # place of its first value
+        groups: list[Group] = []
         size = 0
-        for name in names:
-            variable, index = self.resolve(name)
-            if variable.type not in REAL:
-                raise FmuError(f"expected {name!r} to be real (it is {variable.type})", self.where)
-            if variable.reference not in first:
-                first[variable.reference] = size
+        for kind, dtype in dict.fromkeys(kind_of(v, version) for v in touched.values()):
+            members = [(key, v) for key, v in touched.items() if key[0] == kind]
+            begin = size
+            for key, variable in members:
+                first[key] = size
                 size += variable.size
-            start = first[variable.reference]
+            references = (ctypes.c_uint * len(members))(*(v.reference for _, v in members))
+            groups.append(Group(kind, dtype, references, size - begin))
+        resolved: list[str] = []
+        places: list[int] = []
+        for name, variable, index in asked:
+            start = first[kind_of(variable, version)[0], variable.reference]
             if index is None:
                 resolved += element_names(variable.name, variable.shape)
                 places += range(start, start + variable.size)
             else:
                 resolved.append(name)
                 places.append(start + index)
-        references = (ctypes.c_uint * len(first))(*first)
-        return Ports(tuple(resolved), references, size, np.array(places, dtype=np.intp))
+        if not groups:  # nothing, as doubles
+            groups.append(Group(_DOUBLES[version], np.dtype(float), (ctypes.c_uint * 0)(), 0))
+        return Ports(tuple(resolved), tuple(groups), size, np.array(places, dtype=np.intp))
 
 
-def pointer(values: Array) -> Any:
+def pointer(values: np.ndarray[Any, Any]) -> Any:
     """Return values as the FMI functions take them; the array must outlive the call."""
-    return values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+    return values.ctypes.data_as(ctypes.POINTER(np.ctypeslib.as_ctypes_type(values.dtype)))
