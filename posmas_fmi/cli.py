@@ -172,7 +172,30 @@ def _linearise(arguments: argparse.Namespace) -> int:
         _print_json(made.to_dict())
     else:
         _show_linearisation(made)
-    return DONE
+    return DONE if made.useful else NEGATIVE
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.agent_toml import report
+    from posmas_fmi.fmu.fit import fit_agent
+
+    made = fit_agent(
+        arguments.fmu,
+        arguments.inputs,
+        arguments.outputs,
+        dict(arguments.region) or None,
+        arguments.at,
+        g=arguments.g or None,
+        sec=arguments.sec or None,
+        values=dict(arguments.set),
+        states=arguments.states or None,
+        degree=arguments.degree,
+    )
+    if arguments.json:
+        _print_json(made.to_dict())
+    else:
+        print(f"{report(made)}\n{made.to_toml()}", end="")
+    return DONE if made.useful else NEGATIVE
 
 
 def _not_built(name: str) -> Callable[[argparse.Namespace], int]:
@@ -234,6 +257,8 @@ def _show_linearisation(made: Linearisation) -> None:
         print(f"B >= 0     {'yes' if not low_B else f'no: {low_B}'}")
     for note in made.notes:
         print(f"note       {note}")
+    if not made.useful:
+        print(f"verdict    of no use: the error is {made.uncertainty:.0%} of the largest entry")
 
 
 def _certified(made: Design) -> str:
@@ -372,14 +397,54 @@ def _parser() -> argparse.ArgumentParser:
     paper = add("paper", _paper, "the ledger: printed, computed, verdict, proof")
     paper.add_argument("--json", action="store_true", help="print the entries as JSON")
 
-    linear = add("linearise", _linearise, "linear model of an FMU at an operating point")
-    linear.add_argument("fmu", type=Path, metavar="FMU", help="of Model Exchange or Co-Simulation")
+    text = "linear model of an FMU at an operating point; exit code 1 if its error is too large"
+    linear = add("linearise", _linearise, text)
+    _add_operating_point(linear)
+    linear.add_argument("--step", type=_positive, metavar="S", help="communication step [s]")
+    linear.add_argument("--json", action="store_true", help="print the model as JSON")
+
+    fit = add("fit", _fit, "fit model (1) to an FMU and print it as sections of a scenario")
+    _add_operating_point(fit)
+    for option, kind, metavar, text in (
+        (
+            "--region",
+            _region,
+            "NAME=LOW:HIGH",
+            "deviations from the operating point: x, u for all states and inputs, x1, u1, ... for "
+            "single ones; t in seconds (default: a tenth of each variable's size either side)",
+        ),
+        ("--g", str, "EXPR", "candidates for g in t, x1, ... (default: a polynomial)"),
+        ("--sec", str, "EXPR", "sec of each input in u1, ... (default: a polynomial)"),
+    ):
+        fit.add_argument(
+            option,
+            type=kind,
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar=metavar,
+            help=text,
+        )
+    fit.add_argument(
+        "--degree", type=int, choices=(1, 2, 3, 4, 5), default=2, help="of the polynomial g"
+    )
+    fit.add_argument("--json", action="store_true", help="print the fit as JSON")
+
+    for name, text in (("check", "preflight of any FMU"),):
+        later = add(name, _not_built(name), f"{text} (not in this version yet)")
+        later.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    return parser
+
+
+def _add_operating_point(command: Any) -> None:
+    """Add what says which signals of which FMU, where."""
+    command.add_argument("fmu", type=Path, metavar="FMU", help="of Model Exchange or Co-Simulation")
     for option, dest, required, text in (
         ("--in", "inputs", True, "inputs"),
         ("--out", "outputs", True, "outputs: any real variables"),
         ("--states", "states", False, "states, of an FMU that does not declare any"),
     ):
-        linear.add_argument(
+        command.add_argument(
             option,
             dest=dest,
             nargs="+",
@@ -388,9 +453,8 @@ def _parser() -> argparse.ArgumentParser:
             required=required,
             help=text,
         )
-    linear.add_argument("--at", type=_seconds, default=0.0, metavar="T", help="time [s]")
-    linear.add_argument("--step", type=_positive, metavar="S", help="communication step [s]")
-    linear.add_argument(
+    command.add_argument("--at", type=_seconds, default=0.0, metavar="T", help="time [s]")
+    command.add_argument(
         "--set",
         type=_assignment,
         nargs="+",
@@ -399,12 +463,6 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         help="parameters, start values and inputs",
     )
-    linear.add_argument("--json", action="store_true", help="print the model as JSON")
-
-    for name, text in (("check", "preflight of any FMU"),):
-        later = add(name, _not_built(name), f"{text} (not in this version yet)")
-        later.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
-    return parser
 
 
 class _Version(argparse.Action):
@@ -446,3 +504,12 @@ def _assignment(text: str) -> tuple[str, float]:
     if not name or not abs(value) < float("inf"):
         raise argparse.ArgumentTypeError(f"expected NAME=NUMBER (got {text!r})")
     return name, value
+
+
+def _region(text: str) -> tuple[str, tuple[float, float]]:
+    name, _, ends = text.partition("=")
+    low, _, high = ends.partition(":")
+    try:
+        return name, (float(low), float(high))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected NAME=LOW:HIGH (got {text!r})") from None

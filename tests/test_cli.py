@@ -7,6 +7,8 @@ from fmu_examples import tank_fmu
 
 from posmas_fmi import resources
 from posmas_fmi.cli import main
+from posmas_fmi.fmu.build import fmu
+from posmas_fmi.fmu.plant import read_plant
 
 SHORT = ["run", "paper_example_1", "--until", "0.1"]
 
@@ -168,6 +170,62 @@ def test_linearise_prints_the_linear_model(tmp_path, capsys):
     shown = capsys.readouterr().out
     for line in ("temperature = 300", "continuous", "-0.04 (stable)", "Metzler    yes"):
         assert line in shown
+
+
+def test_a_linear_model_of_no_use_is_a_negative_verdict(tmp_path, capsys):
+    tank_fmu(tmp_path, 2)
+    folder = tmp_path / "tank"
+    text = (folder / "model.c").read_text(encoding="utf-8")
+    text = text.replace(
+        "x[0] - 290.0)) / 50.0;", "x[0] - 290.0)) / 50.0 + 100.0 * sin(1e6 * x[0]);"
+    )
+    (folder / "model.c").write_text(f"#include <math.h>\n{text}", encoding="utf-8")
+    path = fmu(read_plant(folder), 2, cache=tmp_path)
+    command = [str(path), "--in", "power", "--out", "temperature"]
+    assert main(["linearise", *command]) == 1
+    assert "of no use" in capsys.readouterr().out
+    assert main(["linearise", *command, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["useful"] is False
+    assert main(["fit", *command, "--region", "x=-1:1", "u=-1:1"]) == 1
+    assert "# Verdict: of no use" in capsys.readouterr().out
+
+
+def test_fit_prints_sections_that_a_scenario_takes(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    command = ["fit", str(path), "--in", "power", "--out", "temperature"]
+    region = ["--set", "temperature=340", "--region", "x=-10:10", "u=-50:50"]
+    assert main([*command, *region]) == 0
+    printed = capsys.readouterr().out
+    for line in ("# Metzler: yes", "# Residual: ", "# Sector of power: sec(u)/u in [1, 1]"):
+        assert line in printed
+    head = '[scenario]\nname = "tank"\nuntil = 1.0\nperiod = 0.1\n'
+    head += "[network]\nagents = 2\narcs = [[1, 2]]\npinned = [1]\n[leader]\ns0 = [0.0]\n"
+    scenario = tmp_path / "tank.toml"
+    scenario.write_text(head + printed, encoding="utf-8")
+    assert main(["design", str(scenario), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["certified"] == "yes"
+    assert main([*command, *region, "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["A"] == [[pytest.approx(-0.04)]]
+    assert made["toml"] in printed
+    assert made["useful"] is True
+    # without a region a tenth either side
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "x1 = [-30.0, 30.0]" in printed
+    assert "no region was given" in printed
+
+
+def test_fit_refuses_what_is_no_region(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    command = ["fit", str(path), "--in", "power", "--out", "temperature", "--region"]
+    for text in ("x=1", "x", "=1:2", "x=a:b", "x=2:1", "x=nan:1", "v=0:1", "x=0:1"):
+        try:
+            code = main([*command, text])
+        except SystemExit as caught:
+            code = caught.code
+        assert code == 2, text
+        assert "region" in capsys.readouterr().err
 
 
 def test_linearise_tells_bad_names_from_bad_fmus(tmp_path, capsys):

@@ -46,3 +46,43 @@ def agent_toml(fitted: FittedAgent) -> str:
             for name, value in fitted.values.items()
         ]
     return "\n".join(lines) + "\n"
+
+
+def report(fitted: FittedAgent) -> str:
+    """Return what is known about the fit as comment lines, to go in front of the sections."""
+    made, metzler = fitted.linearisation, fitted.metzler
+    entries = "; ".join(f"A[{i},{j}] = {v:.4g}" for i, j, v in metzler.negative)
+    error = "unknown" if made.error is None else f"{made.error:.3g} at most in an entry"
+    lines = [
+        f"Model (1) of {fitted.path.name} in deviations from its operating point at {made.at:g} s.",
+        f"Linear part: {made.method}, estimated error {error}",
+        f"Metzler: {'yes' if metzler.metzler else f'no, moved into g: {entries}'}",
+        f"B >= 0: {_inputs(fitted)}",
+    ]
+    for name, sampled in zip(made.inputs, fitted.sector, strict=True):
+        lines.append(f"Sector of {name}: sec(u)/u in [{sampled[0]:.6g}, {sampled[1]:.6g}]")
+    if fitted.samples:
+        lines += [
+            f"Slopes: |df/dx - A| up to {fitted.lipschitz.max(initial=0.0):.6g} 1/s",
+            f"Residual: {fitted.residual:.3g} (root mean square, relative), "
+            f"{fitted.residual_max:.3g} at most, on {fitted.samples} fresh samples",
+        ]
+    else:
+        lines.append("Residual: unknown, the nonlinearity was not sampled")
+    lines += [f"Bound {a.name!r}: {a.status}: {a.detail}" for a in fitted.agent.assumptions()]
+    lines.append("Sector, slopes and residual are of samples; statuses are of the fitted model.")
+    lines += [f"Note: {note}" for note in fitted.notes]
+    if not fitted.useful:
+        lines.append(
+            "Verdict: of no use, the error of the linear part or the residual is too large"
+        )
+    return "".join(f"# {' '.join(line.split())}\n" for line in lines)
+
+
+def _inputs(fitted: FittedAgent) -> str:
+    turned = [
+        name
+        for name, scale in zip(fitted.linearisation.inputs, fitted.input_scale, strict=True)
+        if scale < 0
+    ]
+    return "yes" if not turned else f"after counting {', '.join(turned)} the other way round"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
@@ -37,6 +38,8 @@ _NEGLIGIBLE = 1e-8  # of the largest derivative on the region: a term below is l
 _GRID = 33  # points per input for its sector
 _DEGREE_OF_SEC = 5
 _JACOBIANS = 64  # samples at which slopes are taken
+_REACH = 0.1  # of the size of a variable: the region where none is given
+_NO_USE = 0.5  # relative residual from which on a model is of no use
 
 Region = Mapping[str, tuple[float, float]]
 
@@ -91,6 +94,35 @@ class FittedAgent:
     values: Values
     notes: tuple[str, ...]
 
+    @property
+    def useful(self) -> bool:
+        """Whether linearisation and fit are: a relative residual below one half, where sampled."""
+        return self.linearisation.useful and not self.residual >= _NO_USE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as lists and numbers, for JSON."""
+        agent = self.agent
+        return {
+            **{name: getattr(agent, name).tolist() for name in "AHBC"},
+            "g": list(self.g),
+            "sec": list(self.sec),
+            "sector": list(agent.sector),
+            "sector_sampled": self.sector.tolist(),
+            "lipschitz": None if agent.lipschitz is None else np.ravel(agent.lipschitz).tolist(),
+            "slopes_sampled": _known(self.lipschitz),
+            "metzler": self.metzler.to_dict(),
+            "residual": None if np.isnan(self.residual) else self.residual,
+            "residual_max": None if np.isnan(self.residual_max) else self.residual_max,
+            "samples": self.samples,
+            "region": {name: list(pair) for name, pair in agent.region.items()},
+            "assumptions": [attrs.asdict(a) for a in agent.assumptions()],
+            "input_scale": self.input_scale.tolist(),
+            "linearisation": self.linearisation.to_dict(),
+            "useful": self.useful,
+            "notes": list(self.notes),
+            "toml": self.to_toml(),
+        }
+
     def to_toml(self) -> str:
         """Return the ``[agent]`` and ``[plant]`` sections of a scenario.
 
@@ -105,7 +137,7 @@ def fit_agent(
     path: str | Path,
     inputs: Sequence[str],
     outputs: Sequence[str],
-    region: Region,
+    region: Region | None = None,
     at: float = 0.0,
     *,
     g: Sequence[str] | None = None,
@@ -128,9 +160,10 @@ def fit_agent(
     path : path-like
     inputs, outputs : sequence of str
         Variables or elements (``u[1]``).
-    region : mapping
+    region : mapping, optional
         Ranges of the deviations from the operating point: ``x`` and ``u`` for all states and
         inputs, or ``x1``, ``u1``, … for single ones; ``t`` in seconds (default: `at` alone).
+        Without it a tenth of each variable's size either side, and a note that says so.
     at : float
         Time of the operating point [s].
     g : sequence of str, optional
@@ -176,8 +209,15 @@ def fit_agent(
         names = signals(file, inputs, outputs, states)
         check_values(file, values)
         made, f = _linearised(file, names, at, values)
+        notes = []
+        if region is None:
+            region = _around(file, made)
+            notes.append(
+                "no region was given: a tenth of each variable's size either side was taken; "
+                "give the range where the plant works"
+            )
         box = _Box.of(region, len(names.states), len(names.inputs), at)
-        fit = _Fit(made, f, box, samples, seed)
+        fit = _Fit(made, f, box, samples, seed, notes)
         return fit.run(g, sec, degree, Path(path), values)
 
 
@@ -213,6 +253,16 @@ def _linearised(
     return made, None
 
 
+def _around(file: FmuFile, made: Linearisation) -> dict[str, tuple[float, float]]:
+    """Take a region around the operating point: a tenth of the larger of value and nominal value."""
+    found = {}
+    for letter, names, values in (("x", made.states, made.x0), ("u", made.inputs, made.u0)):
+        for k, (name, value) in enumerate(zip(names, values, strict=True)):
+            size = _REACH * max(abs(float(value)), abs(file.variable(name).nominal))
+            found[f"{letter}{k + 1}"] = (-size, size)
+    return found
+
+
 @attrs.frozen(eq=False)
 class _Box:
     """The region in deviations."""
@@ -227,7 +277,7 @@ class _Box:
         for name, bounds in region.items():
             if name not in known:
                 raise InputError(f"expected one of {', '.join(sorted(known))}", f"region.{name}")
-            low, high = bounds
+            low, high = (float(bound) for bound in bounds)
             if not (np.isfinite(low) and np.isfinite(high) and low <= high):
                 raise InputError(
                     f"expected low <= high, both finite (got {bounds})", f"region.{name}"
@@ -549,6 +599,10 @@ def _names(letter: str, count: int) -> list[str]:
 def _digits(M: Array) -> Array:
     """Round to what is shipped: 12 significant digits of each entry."""
     return np.array([float(f"{value:.12g}") for value in M.flat]).reshape(M.shape)
+
+
+def _known(M: Array) -> list[list[float]] | None:
+    return M.tolist() if np.isfinite(M).all() else None
 
 
 def _pair(row: Array) -> tuple[float, float]:

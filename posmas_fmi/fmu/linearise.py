@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 _AGREE = 1e-4  # relative: directional derivatives and differences say the same
 _MISFIT = 1e-3  # relative: a response that a linear model misses
+_NO_USE = 0.1  # relative error of the largest entry from which on a model is of no use
 
 DIRECTIONAL = "directional derivatives"
 DIFFERENCES = "central differences"
@@ -134,6 +135,25 @@ class Linearisation:
         return bool((np.abs(self.poles) < 1).all() if self.dt else (self.poles.real < 0).all())
 
     @property
+    def uncertainty(self) -> float | None:
+        """`error` relative to the largest entry of A and B; None where the error is unknown."""
+        if self.error is None:
+            return None
+        entries = [self.A, self.B] if self.A.size + self.B.size else [self.D]
+        size = max(float(np.abs(M).max(initial=0.0)) for M in entries)
+        if size == 0.0:
+            return 0.0 if self.error == 0.0 else np.inf
+        return self.error / size
+
+    @property
+    def useful(self) -> bool:
+        """Whether the estimated error leaves the largest entry of A and B a digit: below 10 %.
+
+        Small entries can be unknown all the same: compare each with `error`.
+        """
+        return self.uncertainty is None or self.uncertainty < _NO_USE
+
+    @property
     def metzler(self) -> MetzlerReport:
         """What keeps the model from being positive."""
         return metzler_report(self.A, self.B, self.error or 0.0)
@@ -146,6 +166,7 @@ class Linearisation:
                 content[key] = value.tolist()
         content["poles"] = [[float(z.real), float(z.imag)] for z in self.poles]
         content["stable"] = self.stable
+        content["useful"] = self.useful
         # entries mean something only between states that are quantities
         content["metzler"] = self.metzler.to_dict() if self.named and not self.dt else None
         return content
