@@ -254,7 +254,7 @@ def _linearised(
 
 
 def _around(file: FmuFile, made: Linearisation) -> dict[str, tuple[float, float]]:
-    """Take a region around the operating point: a tenth of the larger of value and nominal value."""
+    """Take a region around the operating point: a tenth of the larger of value and nominal."""
     found = {}
     for letter, names, values in (("x", made.states, made.x0), ("u", made.inputs, made.u0)):
         for k, (name, value) in enumerate(zip(names, values, strict=True)):
