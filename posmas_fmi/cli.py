@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from posmas_fmi.errors import InputError, NotBuiltError, PosmasError
+from posmas_fmi.errors import InputError, PosmasError
 
 if TYPE_CHECKING:
     from posmas_fmi.cosim.master import Progress
@@ -198,11 +198,18 @@ def _fit(arguments: argparse.Namespace) -> int:
     return DONE if made.useful else NEGATIVE
 
 
-def _not_built(name: str) -> Callable[[argparse.Namespace], int]:
-    def command(arguments: argparse.Namespace) -> int:
-        raise NotBuiltError(f"'posmas-fmi {name}' is not in this version yet")
+def _check(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.check.preflight import check_fmu
+    from posmas_fmi.fmu.check.text import to_text
 
-    return command
+    made = []
+    for path in arguments.fmus:
+        made.append(check_fmu(path, arguments.inputs, arguments.outputs))
+        if not arguments.json:
+            print(to_text(made[-1]), flush=True)
+    if arguments.json:
+        _print_json({"fmus": [one.to_dict() for one in made]})
+    return max(one.exit_code for one in made)
 
 
 # ---- output -------------------------------------------------------------------------------------
@@ -430,9 +437,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     fit.add_argument("--json", action="store_true", help="print the fit as JSON")
 
-    for name, text in (("check", "preflight of any FMU"),):
-        later = add(name, _not_built(name), f"{text} (not in this version yet)")
-        later.add_argument("rest", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    check = add("check", _check, "preflight of any FMU: exit 0 fine, 1 errors, 3 not usable")
+    check.add_argument("fmus", type=Path, nargs="+", metavar="FMU", help="of FMI 1, 2 or 3")
+    for option, dest, text in (
+        ("--in", "inputs", "inputs that the controller will set"),
+        ("--out", "outputs", "outputs that it will read: any real variables"),
+    ):
+        check.add_argument(
+            option, dest=dest, nargs="+", action="extend", default=[], metavar="NAME", help=text
+        )
+    check.add_argument("--json", action="store_true", help="print everything as JSON")
     return parser
 
 

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+import zipfile
 
 import pytest
 from fmu_examples import tank_fmu
@@ -277,3 +278,46 @@ def test_design_by_contraction_imports_no_solver_of_lmis():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_check_prints_facts_findings_and_a_verdict(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    assert main(["check", str(path), "--in", "power", "--out", "net", "temperature"]) == 0
+    printed = capsys.readouterr().out
+    assert "power [W]" in printed
+    assert printed.splitlines()[-1].startswith("fine: 0 errors")
+    bad = tmp_path / "bad.fmu"
+    bad.write_bytes(path.read_bytes()[:1000])
+    assert main(["check", str(path), str(bad), "--json"]) == 3
+    good, broken = json.loads(capsys.readouterr().out)["fmus"]
+    assert (good["verdict"], broken["verdict"]) == ("fine", "not usable")
+    assert good["inputs"][0]["unit"] == "W"
+    (finding,) = broken["findings"]
+    assert (finding["severity"], finding["code"]) == ("fatal", "archive-damaged")
+    assert main(["check", str(bad)]) == 3
+    assert "fatal    archive-damaged: expected a zip" in capsys.readouterr().out
+
+
+def test_an_error_that_leaves_an_fmu_usable_is_exit_code_1(tmp_path, capsys):
+    path = tank_fmu(tmp_path, 2)
+    one = tmp_path / "one.fmu"
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(one, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            if name == "modelDescription.xml":
+                data = data.replace(b'name="net"', b'name="net&#x9b;31m"')
+                data = data.replace(b'start="100.0"', b'start="NaN"')
+            target.writestr(name, data)
+    assert main(["check", str(one)]) == 1
+    printed = capsys.readouterr().out
+    assert "error    start-not-finite: power" in printed
+    assert "outputs         net\\x9b31m [W]" in printed  # no control sequence gets through
+    assert printed.splitlines()[-1].startswith("usable, with errors: 1 error")
+
+
+@pytest.mark.parametrize("arguments", [["missing.fmu"], ["TANK", "--in", "pwer"]])
+def test_check_of_what_is_not_there_is_bad_input(tmp_path, capsys, arguments):
+    path = tank_fmu(tmp_path, 2)
+    assert main(["check", *(str(path) if a == "TANK" else a for a in arguments)]) == 2
+    said = capsys.readouterr().err
+    assert "no such file" in said or "did you mean 'power'" in said

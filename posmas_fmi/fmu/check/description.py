@@ -150,12 +150,14 @@ def _interfaces(told: Description) -> Iterator[Finding]:
         )
     elif told.interface("Co-Simulation") is None:
         kinds = " and ".join(i.kind for i in told.interfaces)
+        continuous = told.interface("Model Exchange") is not None
         yield Finding(
-            "error",
+            "error" if continuous else "fatal",
             "no-co-simulation",
             _PLACE,
             f"it has {kinds} only: 'posmas-fmi run' takes Co-Simulation",
-            "export it for Co-Simulation; linearise and fit work as it is",
+            "export it for Co-Simulation"
+            + ("; linearise and fit work as it is" if continuous else ""),
         )
     for interface in told.interfaces:
         yield from _capabilities(told, interface)

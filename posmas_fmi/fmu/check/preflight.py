@@ -1,0 +1,190 @@
+"""Preflight of one FMU: everything that is known about it, and what is wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from posmas_fmi.errors import InputError
+from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry
+from posmas_fmi.fmu.check.binaries import Binary, binary_findings, read_binaries
+from posmas_fmi.fmu.check.described import Described, Description, read_description
+from posmas_fmi.fmu.check.description import description_findings, strict_findings
+from posmas_fmi.fmu.check.finding import SEVERITIES, Finding, worst
+
+FINE, ERRORS, UNUSABLE = 0, 1, 3  # exit codes
+VERDICTS = {FINE: "fine", ERRORS: "usable, with errors", UNUSABLE: "not usable"}
+
+
+@attrs.frozen(eq=False)
+class Preflight:
+    """What is known about an FMU.
+
+    Attributes
+    ----------
+    path : Path
+    findings : tuple of Finding
+        The worst first.
+    told : Description or None
+        What its model description says; None if it could not be read safely.
+    binaries : tuple of Binary
+    """
+
+    path: Path
+    findings: tuple[Finding, ...]
+    told: Description | None = None
+    binaries: tuple[Binary, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """0 fine (notes and warnings), 1 errors but usable, 3 unsafe or unusable."""
+        found = worst(self.findings)
+        return UNUSABLE if found == "fatal" else ERRORS if found == "error" else FINE
+
+    @property
+    def verdict(self) -> str:
+        """The exit code in words."""
+        return VERDICTS[self.exit_code]
+
+    def ports(self, causality: str) -> list[Described]:
+        """Return the real variables of that causality."""
+        known = self.told.variables if self.told else ()
+        return [v for v in known if v.causality == causality and v.real]
+
+    def count(self, severity: str) -> int:
+        """Return how many findings have that severity."""
+        return sum(f.severity == severity for f in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as lists, texts and numbers, for JSON."""
+        told = self.told
+        return {
+            "fmu": str(self.path),
+            "verdict": self.verdict,
+            "exit_code": self.exit_code,
+            "findings": [attrs.asdict(f) for f in self.findings],
+            "fmi": told.version if told else None,
+            "model": told.root.get("modelName") if told else None,
+            "tool": told.root.get("generationTool") if told else None,
+            "interfaces": [attrs.asdict(i) for i in told.interfaces] if told else [],
+            "binaries": [b.to_dict() for b in self.binaries],
+            "experiment": told.experiment if told else {},
+            "variables": len(told.variables) if told else None,
+            "inputs": [_port(v) for v in self.ports("input")],
+            "outputs": [_port(v) for v in self.ports("output")],
+            "annotations": list(told.annotations) if told else [],
+        }
+
+
+def check_fmu(
+    path: str | Path, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
+) -> Preflight:
+    """Examine an FMU of FMI 1, 2 or 3; nothing of it is run.
+
+    Parameters
+    ----------
+    path : path-like
+    inputs, outputs : sequence of str
+        Variables that will carry the protocol's u and y; must be there.
+
+    Returns
+    -------
+    Preflight
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or no such variable.
+
+    Examples
+    --------
+    >>> from posmas_fmi.expression import VectorFunction
+    >>> from posmas_fmi.fmu.build import agent_fmu
+    >>> g = VectorFunction.parse(["0"], ["t", "x1"])
+    >>> path = agent_fmu(g, VectorFunction.parse(["tanh(u1)"], ["u1"]), 1, 1, 1)
+    >>> check_fmu(path).verdict
+    'fine'
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("expected an FMU (there is no such file)", str(path))
+    findings = examine(path, whole=True)
+    if worst(findings) == "fatal":
+        return Preflight(path, _ordered(findings))
+    told = read_description(read_entry(path, DESCRIPTION))
+    _names_exist(path, told, [*inputs, *outputs])
+    findings += description_findings(told)
+    binaries: list[Binary] = []
+    if worst(findings) != "fatal":
+        binaries = read_binaries(path)
+        findings += binary_findings(path, told, binaries)
+        findings += strict_findings(path, told)
+    return Preflight(path, _ordered(findings), told, tuple(binaries))
+
+
+def _ordered(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(sorted(findings, key=lambda f: -SEVERITIES.index(f.severity)))
+
+
+def _names_exist(path: Path, told: Description, names: Sequence[str]) -> None:
+    known = {v.name for v in told.variables}
+    arrays = {v.name for v in told.variables if v.dimensions}
+    for name in names:
+        if name in known or re.sub(r"\[\d+(,\d+)*\]$", "", name) in arrays:
+            continue
+        near = get_close_matches(name, known, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise InputError(f"there is no variable {name!r}{hint}", str(path))
+
+
+def _port(variable: Described) -> dict[str, Any]:
+    facts = {
+        "name": variable.name,
+        "unit": variable.unit,
+        "start": variable.start,
+        "min": variable.low,
+        "max": variable.high,
+        "nominal": variable.nominal,
+        "dimensions": list(variable.dimensions),
+    }
+    return {k: v for k, v in facts.items() if v not in (None, [])}
+
+
+def facts(made: Preflight) -> Iterator[tuple[str, str]]:
+    """Return label and text of what is worth showing about an FMU."""
+    told = made.told
+    if told is None:
+        return
+    kinds = " and ".join(i.kind for i in told.interfaces) or "no interface"
+    tool = told.root.get("generationTool")
+    yield "FMI", f"{told.version}, {kinds}" + (f", by {tool}" if tool else "")
+    systems = [
+        f"{b.folder}" + (f" ({'/'.join(b.image.machines)})" if b.image else "")
+        for b in made.binaries
+    ]
+    yield "platforms", ", ".join(dict.fromkeys(systems)) or "none"
+    for label, causality in (("inputs", "input"), ("outputs", "output")):
+        yield label, _listed(made.ports(causality))
+    for interface in told.interfaces:
+        able = [flag for flag in interface.flags if interface.has(flag)]
+        if able:
+            yield interface.kind, ", ".join(able)
+
+
+_SHOWN = 8  # ports in the text
+
+
+def _listed(ports: list[Described]) -> str:
+    texts = [
+        v.name
+        + (f"({','.join(v.dimensions)})" if v.dimensions else "")
+        + (f" [{v.unit}]" if v.unit else "")
+        for v in ports
+    ]
+    more = f" and {len(texts) - _SHOWN} more" if len(texts) > _SHOWN else ""
+    return (", ".join(texts[:_SHOWN]) + more) or "none"
