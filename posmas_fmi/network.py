@@ -205,6 +205,24 @@ class Network:
         """Generalised algebraic connectivity a(L) of (4)."""
         return generalised_connectivity(self.laplacian, self.perron)
 
+    def arc_numbers(self) -> dict[tuple[int, int], int]:
+        """Return the number of each arc (from, to), agents counted from 1 and the leader being 0.
+
+        Arcs between agents are numbered by receiver, those from the leader come after them.
+
+        Examples
+        --------
+        >>> network_from_arcs(2, [(1, 2), (2, 1)], pinned=[2]).arc_numbers()
+        {(2, 1): 0, (1, 2): 1, (0, 2): 2}
+        """
+        a = self.adjacency
+        receiver = np.repeat(np.arange(self.N), np.diff(a.indptr))
+        numbers = {
+            (int(j) + 1, int(i) + 1): k
+            for k, (j, i) in enumerate(zip(a.indices, receiver, strict=True))
+        }
+        return numbers | {(0, i + 1): a.nnz + k for k, i in enumerate(self.pinned)}
+
     def with_pinned(self, pinned: Sequence[int], weight: float = 1.0) -> Network:
         """Return the same digraph with other pinned agents (indices from 0)."""
         d = np.zeros(self.N)

@@ -15,10 +15,12 @@ from posmas_fmi import resources
 from posmas_fmi.agent import Agent, state_names
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.conditions import Sensors, steps_of
 from posmas_fmi.design import DesignSettings
 from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.expression import Array, VectorFunction, parse
 from posmas_fmi.network import Network, network_from_arcs, read_adjacency
+from posmas_fmi.scenario.faults import make_episodes
 from posmas_fmi.scenario.reading import read_tables
 from posmas_fmi.scenario.signals import Signal, Signals, read_signal
 from posmas_fmi.scenario.tables import (
@@ -27,10 +29,13 @@ from posmas_fmi.scenario.tables import (
     ComponentTable,
     ConnectionTable,
     Count,
+    FaultTable,
+    JumpTable,
     NetworkTable,
     PlantTable,
     ScenarioFile,
     ScenarioTable,
+    SensorTable,
     Uniform,
 )
 
@@ -60,6 +65,11 @@ class Scenario:
         Whether the run without control is made as well.
     components : tuple of ComponentTable
     connections : tuple of ConnectionTable
+    faults : tuple of FaultTable
+    sensors : Sensors or None
+        Of the outputs; None: exact.
+    jumps : tuple of (int, (m,) array)
+        Communication points at which the leader goes on from another state.
     signals : Signals or None
         From outside.
     signal_columns : dict of str to (int, int)
@@ -86,6 +96,9 @@ class Scenario:
     baseline: bool
     components: tuple[ComponentTable, ...]
     connections: tuple[ConnectionTable, ...]
+    faults: tuple[FaultTable, ...]
+    sensors: Sensors | None
+    jumps: tuple[tuple[int, Array], ...]
     signals: Signals | None
     signal_columns: dict[str, tuple[int, int]]
     path: Path
@@ -185,6 +198,8 @@ class _Builder:
                     )
                 )
         x0 = xhat0 = s0 = None
+        jumps: tuple[tuple[int, Array], ...] | None = ()
+        sensors: Sensors | None = None
         if agent and network and clock:
             random = np.random.default_rng(abs(tables.scenario.seed))
             n, m = network.N, agent.m
@@ -192,7 +207,12 @@ class _Builder:
             xhat0 = self.attempt(
                 lambda: initial(tables.initial.xhat, n, m, random, "$.initial.xhat")
             )
-            s0 = self.attempt(lambda: _leader(tables.leader.s0, m))
+            s0 = self.attempt(lambda: _leader(tables.leader.s0, m, "$.leader.s0"))
+            q = agent.q
+            sensors = self.attempt(lambda: _sensors(tables.sensors, n, q))
+            jumps = self.attempt(lambda: _jumps(tables.leader.jump, m, clock))
+            if agent is not None and not pins_open(tables.network):
+                self.attempt(lambda: make_episodes(tables.fault, network, agent, clock))
             self.attempt(lambda: make_channel(tables.channel, network, clock.h))
         self.check_components(network)
         made: dict[str, Signal] = {}
@@ -230,6 +250,9 @@ class _Builder:
             baseline=tables.report.baseline,
             components=tuple(tables.component),
             connections=tuple(tables.connection),
+            faults=tuple(tables.fault),
+            sensors=sensors,
+            jumps=jumps or (),
             signals=Signals(tuple(made.values()), clock) if made else None,
             signal_columns=_columns(made),
             path=self.path,
@@ -436,12 +459,40 @@ def initial(value: Any, n: int, m: int, random: np.random.Generator, place: str)
     return np.array(np.broadcast_to(array, (n, m)))
 
 
-def _leader(s0: list[float], m: int) -> Array:
+def _leader(s0: list[float], m: int, place: str) -> Array:
     if len(s0) != m:
-        raise InputError(f"expected {m} values, one per state (got {len(s0)})", "$.leader.s0")
+        raise InputError(f"expected {m} values, one per state (got {len(s0)})", place)
     if min(s0) < 0:
-        raise InputError("expected a non-negative leader: agents are positive", "$.leader.s0")
+        raise InputError("expected a non-negative leader: agents are positive", place)
     return np.array(s0, dtype=float)
+
+
+def _sensors(table: SensorTable, n: int, q: int) -> Sensors | None:
+    rows = {}
+    for name in ("noise", "resolution"):
+        given = np.atleast_1d(np.asarray(getattr(table, name), dtype=float))
+        if given.size not in (1, q) or (given < 0).any():
+            raise InputError(
+                f"expected one number >= 0 or {q}, one per output (got {given.tolist()})",
+                f"$.sensors.{name}",
+            )
+        rows[name] = np.array(np.broadcast_to(given, (n, q)))
+    return Sensors(**rows) if any(row.any() for row in rows.values()) else None
+
+
+def _jumps(jumps: list[JumpTable], m: int, clock: Clock) -> tuple[tuple[int, Array], ...]:
+    made: list[tuple[int, Array]] = []
+    for k, jump in enumerate(jumps):
+        place = f"$.leader.jump[{k}]"
+        if not jump.at > (jumps[k - 1].at if k else 0.0):
+            raise InputError("expected times > 0 s, one after the other", f"{place}.at")
+        made.append((steps_of(jump.at, clock.h), _leader(jump.s, m, f"{place}.s")))
+    return tuple(made)
+
+
+def pins_open(table: NetworkTable) -> bool:
+    """Whether the design is to choose the pins."""
+    return not isinstance(table.pinned, list)
 
 
 def make_channel(table: ChannelTable, network: Network, h: float) -> Channel:
@@ -452,9 +503,9 @@ def make_channel(table: ChannelTable, network: Network, h: float) -> Channel:
     InputError
     """
     arcs = network.adjacency.nnz + len(network.pinned)
-    channel = Channel.uniform(arcs, h, table.delay, table.jitter, table.loss)
+    channel = Channel.uniform(arcs, h, table.delay, table.jitter, table.loss, table.resolution)
     delay, jitter, loss = channel.delay.copy(), channel.jitter.copy(), channel.loss.copy()
-    numbers = _arc_numbers(network)
+    numbers = network.arc_numbers()
     for k, arc in enumerate(table.arc):
         place = f"$.channel.arc[{k}]"
         number = numbers.get(arc.arc)
@@ -467,15 +518,4 @@ def make_channel(table: ChannelTable, network: Network, h: float) -> Channel:
         except InputError as error:
             raise InputError(error.message, f"{place}.{error.where.split('.')[-1]}") from None
         delay[number], jitter[number], loss[number] = one.delay[0], one.jitter[0], one.loss[0]
-    return Channel(delay, jitter, loss)
-
-
-def _arc_numbers(network: Network) -> dict[tuple[int, int], int]:
-    """Return the number of each arc (from, to), agents counted from 1 and the leader being 0."""
-    a = network.adjacency
-    receiver = np.repeat(np.arange(network.N), np.diff(a.indptr))
-    numbers = {
-        (int(j) + 1, int(i) + 1): k
-        for k, (j, i) in enumerate(zip(a.indices, receiver, strict=True))
-    }
-    return numbers | {(0, i + 1): a.nnz + k for k, i in enumerate(network.pinned)}
+    return Channel(delay, jitter, loss, table.resolution)

@@ -17,7 +17,7 @@ import numpy as np
 
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.law import ProtocolLaw
-from posmas_fmi.cosim.master import Outcome, Progress, System
+from posmas_fmi.cosim.master import Iteration, Outcome, Progress, System
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
@@ -25,6 +25,8 @@ from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
+from posmas_fmi.scenario.coverage import coverage
+from posmas_fmi.scenario.faults import describe, make_episodes
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
 from posmas_fmi.scenario.verdict import summarise
 
@@ -134,6 +136,19 @@ def run(
     began = time.perf_counter()
     outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress)
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
+    summary["coverage"] = coverage(scenario, designed)
+    if scenario.faults:
+        summary["faults"] = describe(list(scenario.faults), designed.network, scenario.clock)
+    if outcome.incidents:
+        summary["incidents"] = [
+            {
+                "agent": incident.instance,
+                "time": incident.time,
+                "verdict": incident.reason,
+                "action": incident.action,
+            }
+            for incident in outcome.incidents
+        ]
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
         keys = ("verdict", "tracking_error_final", "min_state")
@@ -237,7 +252,23 @@ def make_system(scenario: Scenario, designed: Design, instances: Instances) -> S
         s0=scenario.s0,
         seed=scenario.settings.seed,
         wiring=instances.wiring,
+        episodes=make_episodes(list(scenario.faults), network, scenario.agent, scenario.clock),
+        leader_changes=scenario.jumps,
+        sensors=scenario.sensors,
+        every=instances.every,
+        **_coupling(scenario),
     )
+
+
+def _coupling(scenario: Scenario) -> dict[str, Any]:
+    """How connected FMUs step, as arguments of `System`."""
+    N, coupling = scenario.network.N, scenario.settings.coupling
+    if coupling == "iterate":
+        return {"iteration": Iteration()}
+    if coupling == "gauss-seidel":
+        components = (np.array([N + k]) for k in range(len(scenario.components)))
+        return {"stages": (np.arange(N), *components)}
+    return {}
 
 
 def _recorder(

@@ -6,15 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import numpy as np
 
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
-from posmas_fmi.cosim.wiring import Wiring
-from posmas_fmi.errors import ScenarioError
+from posmas_fmi.cosim.wiring import Whole, Wiring
+from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
-from posmas_fmi.scenario.tables import Port
+from posmas_fmi.scenario.tables import Override, Port
 from posmas_fmi.scenario.wire import Instance, Recorded, Wires
 
 SHIPPED = "positive_agent"
@@ -78,6 +79,8 @@ class Instances:
     shows_states : bool
     stop : float
         End of the run [s].
+    every : (instances,) array of int
+        Period of each in communication steps.
     """
 
     specs: tuple[PlantSpec, ...]
@@ -85,6 +88,7 @@ class Instances:
     recorded: Recorded
     shows_states: bool
     stop: float
+    every: Whole
 
     def start(self) -> FmuPlant:
         """Load and initialise them.
@@ -114,19 +118,8 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
         If ports are missing, or what is wired to what is not clear.
     """
     plant, N = scenario.plant, scenario.network.N
-    states = _ports(scenario, "states", scenario.agent.m) if _shows_states(scenario) else None
-    outputs = _required(scenario, "outputs", scenario.agent.q)
-    agents = [
-        Instance(
-            scenario.network.names[k],
-            path,
-            _values(scenario, k),
-            _required(scenario, "inputs", scenario.agent.p),
-            outputs if states is None else outputs + states,
-            plant.tolerance,
-        )
-        for k, path in enumerate(files[:N])
-    ]
+    shows_states = _shows_states(scenario)
+    agents = [_agent_instance(scenario, k, path, shows_states) for k, path in enumerate(files[:N])]
     nothing = PortMap.plain(())
     components = [
         Instance(table.name, path, table.parameters, nothing, nothing, table.tolerance)
@@ -145,9 +138,46 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
         tuple(one.spec() for one in (*agents, *components)),
         wiring,
         recorded,
-        states is not None,
+        shows_states,
         scenario.clock.time(scenario.clock.steps),
+        _periods(scenario),
     )
+
+
+def _agent_instance(scenario: Scenario, k: int, path: Path, shows_states: bool) -> Instance:
+    agent, own = scenario.agent, _override(scenario, k)
+    readings = _ports(scenario, "outputs", agent.q, own)
+    if shows_states:
+        readings = readings + _ports(scenario, "states", agent.m, own)
+    return Instance(
+        scenario.network.names[k],
+        path,
+        _values(scenario, k),
+        _ports(scenario, "inputs", agent.p, own),
+        readings,
+        scenario.plant.tolerance,
+    )
+
+
+def _override(scenario: Scenario, k: int) -> tuple[int, Override] | None:
+    """Last of the overrides for agent k, and its number."""
+    found = [(i, o) for i, o in enumerate(scenario.plant.override) if o.agent == k + 1]
+    return found[-1] if found else None
+
+
+def _periods(scenario: Scenario) -> Whole:
+    """Period of each instance in communication steps."""
+    every = np.ones(scenario.network.N + len(scenario.components), dtype=np.int64)
+    for k, override in enumerate(scenario.plant.override):
+        place = f"$.plant.override[{k}].every"
+        if override.every < 1 or scenario.clock.steps % override.every:
+            raise InputError(
+                f"expected a whole number >= 1 that divides the {scenario.clock.steps} "
+                f"communication steps of the run (got {override.every})",
+                place,
+            )
+        every[override.agent - 1] = override.every
+    return every
 
 
 def _values(scenario: Scenario, k: int) -> dict[str, Any]:
@@ -171,18 +201,16 @@ def _shows_states(scenario: Scenario) -> bool:
     return scenario.plant.states is not None or scenario.plant.fmu == SHIPPED
 
 
-def _required(scenario: Scenario, kind: str, count: int) -> PortMap:
-    ports = _ports(scenario, kind, count)
-    assert ports is not None
-    return ports
-
-
-def _ports(scenario: Scenario, kind: str, count: int) -> PortMap | None:
+def _ports(
+    scenario: Scenario, kind: str, count: int, override: tuple[int, Override] | None
+) -> PortMap:
     """Port map in the order of the protocol's names; the shipped FMU's by default."""
     letter = {"inputs": "u", "outputs": "y", "states": "x"}[kind]
     names = [f"{letter}{k + 1}" for k in range(count)]
     table: dict[str, str | Port] | None = getattr(scenario.plant, kind)
     place = f"$.plant.{kind}"
+    if override is not None and getattr(override[1], kind) is not None:
+        table, place = getattr(override[1], kind), f"$.plant.override[{override[0]}].{kind}"
     if table is None:
         if scenario.plant.fmu != SHIPPED:
             raise ScenarioError(

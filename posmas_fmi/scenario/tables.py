@@ -44,6 +44,10 @@ class ScenarioTable:
         rounding.
     threads : int
         Of the engine, if the FMUs allow it. The results do not depend on it.
+    coupling : {"jacobi", "gauss-seidel", "iterate"}
+        How FMUs that are connected step: all at once with readings of the last communication
+        point; agents first, then each component with what those before it show by then; or all
+        at once, again and again until inputs and readings fit (the FMUs must give their states).
     """
 
     name: str
@@ -53,6 +57,7 @@ class ScenarioTable:
     tolerance: float = 1e-2
     engine: Literal["auto", "c", "numpy"] = "auto"
     threads: int = 1
+    coupling: Literal["jacobi", "gauss-seidel", "iterate"] = "jacobi"
 
 
 @attrs.frozen
@@ -114,11 +119,27 @@ class Port:
 
 @attrs.frozen
 class Override:
-    """``[[plant.override]]``: what is different for one agent (numbered from 1)."""
+    """``[[plant.override]]``: what is different for one agent (numbered from 1).
+
+    Attributes
+    ----------
+    agent : int
+    fmu : str, optional
+    parameters : table
+        Besides those of ``[plant]``.
+    inputs, outputs, states : table, optional
+        Its own ports.
+    every : int
+        Its control period in communication steps.
+    """
 
     agent: int
     fmu: str | None = None
     parameters: dict[str, Any] = attrs.field(factory=dict)
+    inputs: dict[str, str | Port] | None = None
+    outputs: dict[str, str | Port] | None = None
+    states: dict[str, str | Port] | None = None
+    every: int = 1
 
 
 @attrs.frozen
@@ -234,10 +255,82 @@ class ConnectionTable:
 
 
 @attrs.frozen
+class SensorTable:
+    """``[sensors]``: what the sensors of the outputs make of them.
+
+    Attributes
+    ----------
+    noise : float or list of float
+        Standard deviation, of all outputs or of each.
+    resolution : float or list of float
+        Step between two values; 0: none.
+    """
+
+    noise: float | list[float] = 0.0
+    resolution: float | list[float] = 0.0
+
+
+@attrs.frozen
+class FaultTable:
+    """``[[fault]]``: what is otherwise for a time.
+
+    Attributes
+    ----------
+    kind : str
+        One of ``sensor stuck``, ``sensor bias``, ``actuator stuck``, ``actuator slow``,
+        ``messages lost``, ``leader lost``, ``arc off``.
+    at : float
+        When it begins [s].
+    until : float, optional
+        When it ends [s]; left out: never.
+    agents : list of int
+        Whose sensors or actuators; default all.
+    ports : list of int
+        Which outputs or inputs of these, counted from 1; default all.
+    arcs : list of [from, to]
+        For messages and arcs; 0 is the leader; default all.
+    value : float, optional
+        The bias; the part of the way that a slow actuator goes in each step (0 to 1); the
+        probability of loss (default 1).
+    """
+
+    kind: Literal[
+        "sensor stuck",
+        "sensor bias",
+        "actuator stuck",
+        "actuator slow",
+        "messages lost",
+        "leader lost",
+        "arc off",
+    ]
+    at: float
+    until: float | None = None
+    agents: list[int] = attrs.field(factory=list)
+    ports: list[int] = attrs.field(factory=list)
+    arcs: list[tuple[int, int]] = attrs.field(factory=list)
+    value: float | None = None
+
+
+@attrs.frozen
+class JumpTable:
+    """``[[leader.jump]]``: at a time [s] the leader goes on from another state."""
+
+    at: float
+    s: list[float]
+
+
+@attrs.frozen
 class LeaderTable:
-    """``[leader]``: its initial state."""
+    """``[leader]``: its initial state, and jumps to other states.
+
+    Attributes
+    ----------
+    s0 : list of float
+    jump : list of JumpTable
+    """
 
     s0: list[float]
+    jump: list[JumpTable] = attrs.field(factory=list)
 
 
 @attrs.frozen
@@ -260,11 +353,24 @@ class ArcTable:
 
 @attrs.frozen
 class ChannelTable:
-    """``[channel]``: delay and jitter [s] and loss (probability) of every arc."""
+    """``[channel]``: delay and jitter [s] and loss (probability) of every arc.
+
+    Attributes
+    ----------
+    delay, jitter : float
+        Of every message [s], rounded up to communication steps.
+    loss : float
+        Probability that a message is lost; the last value is kept.
+    resolution : float
+        Messages are rounded to multiples of it; 0: they are not.
+    arc : list of ArcTable
+        What is different on single arcs.
+    """
 
     delay: float = 0.0
     jitter: float = 0.0
     loss: float = 0.0
+    resolution: float = 0.0
     arc: list[ArcTable] = attrs.field(factory=list)
 
 
@@ -291,3 +397,5 @@ class ScenarioFile:
     signals: dict[str, SignalTable] = attrs.field(factory=dict)
     component: list[ComponentTable] = attrs.field(factory=list)
     connection: list[ConnectionTable] = attrs.field(factory=list)
+    fault: list[FaultTable] = attrs.field(factory=list)
+    sensors: SensorTable = attrs.field(factory=SensorTable)

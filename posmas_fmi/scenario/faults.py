@@ -1,0 +1,144 @@
+"""Faults of a scenario: what is otherwise for a time, and what the certificate says of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from posmas_fmi.agent import Agent
+from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.conditions import NEVER, Episode, steps_of
+from posmas_fmi.errors import InputError
+from posmas_fmi.network import Network
+from posmas_fmi.scenario.tables import FaultTable
+
+# What each kind does, and what is proved all the same where P, C or T hold.
+KINDS = {
+    "sensor stuck": "shows its last value; not covered: the observer follows a false output",
+    "sensor bias": "an added value; not covered, but bounded: certificate G gives the band of a "
+    "bounded disturbance E·bias",
+    "actuator stuck": "keeps its last position; not covered",
+    "actuator slow": "goes a part of the way in each step; not covered",
+    "messages lost": "the last message is held; covered by certificate D as a delay of at most "
+    "the episode, if what is proved covers delays",
+    "leader lost": "the last state heard is held; covered by certificate D as a delay, so agents "
+    "agree on what was heard last while the leader may go on",
+    "arc off": "the arc is not in the digraph; covered as long as the digraph without it is "
+    "certified by itself and changes are rare",
+}
+
+
+def make_episodes(
+    faults: list[FaultTable], network: Network, agent: Agent, clock: Clock
+) -> tuple[Episode, ...]:
+    """Return the episodes of the faults.
+
+    Parameters
+    ----------
+    faults : list of FaultTable
+    network : Network
+        With its pins.
+    agent : Agent
+    clock : Clock
+
+    Raises
+    ------
+    InputError
+        If an agent, a port or an arc does not exist, or a value is missing or out of range.
+    """
+    return tuple(
+        episode
+        for k, fault in enumerate(faults)
+        for episode in _episodes(fault, network, agent, clock, f"$.fault[{k}]")
+    )
+
+
+def _episodes(
+    fault: FaultTable, network: Network, agent: Agent, clock: Clock, place: str
+) -> list[Episode]:
+    begin, end = steps_of(fault.at, clock.h), steps_of(fault.until, clock.h)
+    if not fault.at >= 0:
+        raise InputError(f"expected a time >= 0 s (got {fault.at:g})", f"{place}.at")
+    if end <= begin:
+        raise InputError(f"expected a time after {fault.at:g} s", f"{place}.until")
+    if fault.kind in ("messages lost", "leader lost", "arc off"):
+        arcs = _arcs(fault, network, place)
+        if fault.kind == "arc off":
+            return [Episode("arc_off", arcs, 1.0, begin, end)]
+        return [Episode("loss", arcs, _value(fault, place, 1.0, 0.0, 1.0), begin, end)]
+    agents = _agents(fault, network, place)
+    if fault.kind.startswith("sensor"):
+        ports = _ports(fault, agent.q, "outputs", place)
+        if fault.kind == "sensor stuck":
+            return [Episode("sensor_gain", np.ix_(agents, ports), 0.0, begin, end)]
+        bias = _value(fault, place, None)
+        return [Episode("sensor_offset", np.ix_(agents, ports), bias, begin, end)]
+    ports = _ports(fault, agent.p, "inputs", place)
+    gain = 0.0 if fault.kind == "actuator stuck" else _value(fault, place, None, 0.0, 1.0)
+    return [Episode("actuator_gain", np.ix_(agents, ports), gain, begin, end)]
+
+
+def _value(
+    fault: FaultTable, place: str, default: float | None, low: float = -1e300, high: float = 1e300
+) -> float:
+    value = default if fault.value is None else fault.value
+    if value is None:
+        raise InputError(f"this key is missing: {fault.kind!r} needs it", f"{place}.value")
+    if not low <= value <= high:
+        raise InputError(f"expected {low:g} to {high:g} (got {value:g})", f"{place}.value")
+    return value
+
+
+def _agents(fault: FaultTable, network: Network, place: str) -> list[int]:
+    given = fault.agents or list(range(1, network.N + 1))
+    for k, number in enumerate(given):
+        if not 1 <= number <= network.N:
+            raise InputError(f"expected 1 to {network.N} (got {number})", f"{place}.agents[{k}]")
+    return [number - 1 for number in given]
+
+
+def _ports(fault: FaultTable, count: int, what: str, place: str) -> list[int]:
+    given = fault.ports or list(range(1, count + 1))
+    for k, number in enumerate(given):
+        if not 1 <= number <= count:
+            raise InputError(
+                f"expected 1 to {count}, a number of the agent's {what} (got {number})",
+                f"{place}.ports[{k}]",
+            )
+    return [number - 1 for number in given]
+
+
+def _arcs(fault: FaultTable, network: Network, place: str) -> Any:
+    numbers = network.arc_numbers()
+    if fault.kind == "leader lost":
+        return [k for (sender, _), k in numbers.items() if sender == 0]
+    if not fault.arcs:
+        return list(numbers.values())
+    chosen = []
+    for k, arc in enumerate(fault.arcs):
+        if arc not in numbers:
+            raise InputError(
+                f"there is no arc from {arc[0]} to {arc[1]} in the network", f"{place}.arcs[{k}]"
+            )
+        chosen.append(numbers[arc])
+    return chosen
+
+
+def describe(faults: list[FaultTable], network: Network, clock: Clock) -> list[dict[str, Any]]:
+    """Say for summary.json what was otherwise, when, and what is proved of it."""
+    rows = []
+    for fault in faults:
+        detail, _, covered = KINDS[fault.kind].partition("; ")
+        begin, end = steps_of(fault.at, clock.h), steps_of(fault.until, clock.h)
+        rows.append(
+            {
+                "kind": fault.kind,
+                "agent": ", ".join(network.names[n - 1] for n in fault.agents) or "all",
+                "from": clock.time(begin),
+                "until": None if end == NEVER else clock.time(end),
+                "detail": detail,
+                "covered": covered,
+            }
+        )
+    return rows

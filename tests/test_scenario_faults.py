@@ -1,0 +1,134 @@
+"""Faults, jumps of the leader, longer periods and channels in a scenario file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+
+from posmas_fmi import load, resources, run
+from posmas_fmi.errors import InputError, ScenarioError
+
+DESIGN = 'method = "contraction"\nphi = 10.0'
+GIVEN = """method = "gains"
+K = [[-0.541353, -0.548052]]
+E = [[0.0, 9.27812], [0.0, 9.6018]]
+phi = 10.0
+
+[report]
+baseline = false
+"""
+
+
+def scenario(folder: Path, more: str) -> str:
+    text = (resources.shipped("models") / "paper_example_1_tanh.toml").read_text()
+    assert DESIGN in text
+    path = folder / "scenario.toml"
+    path.write_text(f"{text.replace(DESIGN, GIVEN)}\n{more}")
+    return str(path)
+
+
+def result(folder: Path, more: str = "", until: float = 1.0) -> tuple[dict[str, Any], Any]:
+    made = run(load(scenario(folder, more), until=until), folder / "out", report=False)
+    with xarray.open_dataset(folder / "out" / "results.nc") as data:
+        return made.summary, data.load()
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return result(tmp_path_factory.mktemp("plain"))
+
+
+def steps(data: Any, time: float) -> int:
+    return int(np.searchsorted(data["time"].values, time))
+
+
+def test_a_stuck_sensor_deceives_its_observer_from_then_on(tmp_path: Path, plain: Any) -> None:
+    summary, data = result(
+        tmp_path, '[[fault]]\nkind = "sensor stuck"\nat = 0.2\nuntil = 0.6\nagents = [3]\n'
+    )
+    usual, k = plain[1], steps(data, 0.2)
+    np.testing.assert_array_equal(data["xhat"][: k + 1], usual["xhat"][: k + 1])
+    assert np.abs(data["xhat"][k + 5 :, 2] - usual["xhat"][k + 5 :, 2]).max() > 1e-3
+    (fault,) = summary["faults"]
+    assert (fault["from"], fault["until"], fault["agent"]) == (0.2, 0.6, "3")
+    assert fault["covered"].startswith("not covered")
+
+
+def test_a_stuck_actuator_keeps_the_input_of_the_plant(tmp_path: Path, plain: Any) -> None:
+    _, data = result(tmp_path, '[[fault]]\nkind = "actuator stuck"\nat = 0.1\n')
+    usual, k = plain[1], steps(data, 0.1)
+    np.testing.assert_array_equal(data["x"][: k + 1], usual["x"][: k + 1])
+    assert np.abs(data["x"][-1] - usual["x"][-1]).max() > 1e-2
+
+
+def test_a_leader_that_is_lost_is_remembered(tmp_path: Path) -> None:
+    jump = "[[leader.jump]]\nat = 0.3\ns = [2.0, 2.0]\n"
+    text = jump + '[[fault]]\nkind = "leader lost"\nat = 0.2\n'
+    _, lost = result(tmp_path, text)
+    _, heard = result(tmp_path, jump)
+    k = steps(heard, 0.3)
+    assert (heard["s"][k] == 2.0).all()
+    assert (heard["s"][k - 1] < 1.6).all()
+    assert np.abs(heard["x"][-1] - lost["x"][-1]).max() > 0.1
+
+
+def test_an_agent_with_a_longer_period_holds_its_input(tmp_path: Path) -> None:
+    summary, data = result(tmp_path, "[[plant.override]]\nagent = 2\nevery = 4\n")
+    u = data["u"].values[:200, 1, 0].reshape(50, 4)
+    np.testing.assert_array_equal(u, u[:, :1].repeat(4, axis=1))
+    assert len(np.unique(u)) > 40
+    assert [row["covered"] for row in summary["coverage"]] == [False]
+
+
+def test_an_agent_with_its_own_ports(tmp_path: Path, plain: Any) -> None:
+    own = '[[plant.override]]\nagent = 1\noutputs = {y1 = "y[2]", y2 = "y[1]"}\n'
+    _, data = result(tmp_path, own)
+    np.testing.assert_array_equal(data["y"][0, 0], plain[1]["y"][0, 0, ::-1])
+    np.testing.assert_array_equal(data["y"][0, 1:], plain[1]["y"][0, 1:])
+
+
+def test_rounded_messages_and_delays_say_what_is_covered(tmp_path: Path) -> None:
+    summary, _ = result(tmp_path, "[channel]\nresolution = 0.25\ndelay = 0.01\n")
+    assert [(row["what"], row["covered"]) for row in summary["coverage"]] == [
+        ("delay of messages", True),
+        ("rounded messages", False),
+    ]
+
+
+def test_noise_of_sensors(tmp_path: Path, plain: Any) -> None:
+    _, data = result(tmp_path, "[sensors]\nnoise = [0.05, 0.1]\n")
+    assert np.abs(data["xhat"] - plain[1]["xhat"]).max() > 1e-3
+
+
+WRONG = {
+    "agent": ('[[fault]]\nkind = "sensor stuck"\nat = 0.1\nagents = [5]', "$.fault[0].agents[0]"),
+    "port": ('[[fault]]\nkind = "sensor stuck"\nat = 0.1\nports = [3]', "$.fault[0].ports[0]"),
+    "bias": ('[[fault]]\nkind = "sensor bias"\nat = 0.1', "$.fault[0].value"),
+    "slow": ('[[fault]]\nkind = "actuator slow"\nat = 0.1\nvalue = 2.0', "$.fault[0].value"),
+    "until": ('[[fault]]\nkind = "leader lost"\nat = 0.1\nuntil = 0.1', "$.fault[0].until"),
+    "arc": ('[[fault]]\nkind = "arc off"\nat = 0.1\narcs = [[1, 2]]', "$.fault[0].arcs[0]"),
+    "kind": ('[[fault]]\nkind = "broken"\nat = 0.1', "$.fault[0].kind"),
+    "jump": ("[[leader.jump]]\nat = 0.1\ns = [1.0]", "$.leader.jump[0].s"),
+    "order": (
+        "[[leader.jump]]\nat = 0.2\ns = [1.0, 1.0]\n[[leader.jump]]\nat = 0.1\ns = [1.0, 1.0]",
+        "$.leader.jump[1].at",
+    ),
+    "noise": ("[sensors]\nnoise = [0.1, 0.1, 0.1]", "$.sensors.noise"),
+    "every": ("[[plant.override]]\nagent = 1\nevery = 7", "$.plant.override[0].every"),
+    "ports": (
+        '[[plant.override]]\nagent = 1\ninputs = {u2 = "u[1]"}',
+        "$.plant.override[0].inputs.u1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_mistakes_name_their_place(name: str, tmp_path: Path) -> None:
+    text, place = WRONG[name]
+    with pytest.raises((InputError, ScenarioError)) as caught:
+        result(tmp_path, text)
+    assert place in str(caught.value)
