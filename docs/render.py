@@ -29,13 +29,21 @@ NOTE = """<!-- Made by docs/render.py from notebooks/{name}.py: edit that, then 
 
 
 @attrs.frozen(eq=False)
+class Figure:
+    """A figure, and the titles of its plots."""
+
+    png: bytes
+    title: str
+
+
+@attrs.frozen(eq=False)
 class Cell:
-    """One cell; `printed` and `figures` (PNG) are what executing its code left."""
+    """One cell; `printed` and `figures` are what executing its code left."""
 
     kind: str  # "code" or "markdown"
     source: str
     printed: str = ""
-    figures: tuple[bytes, ...] = ()
+    figures: tuple[Figure, ...] = ()
 
 
 def main(names: list[str]) -> None:
@@ -82,9 +90,10 @@ def _execute(cell: Cell, names: dict[str, Any]) -> Cell:
         print(value, file=printed)
     figures = []
     for number in plt.get_fignums():
-        image = io.BytesIO()
-        plt.figure(number).savefig(image, format="png", metadata={"Software": None})
-        figures.append(image.getvalue())
+        image, figure = io.BytesIO(), plt.figure(number)
+        figure.savefig(image, format="png", metadata={"Software": None})
+        titles = [axes.get_title() for axes in figure.axes]
+        figures.append(Figure(image.getvalue(), "; ".join(filter(None, titles))))
     return attrs.evolve(cell, printed=printed.getvalue(), figures=tuple(figures))
 
 
@@ -96,9 +105,9 @@ def write(name: str, cells: list[Cell]) -> None:
     PAGES.mkdir(exist_ok=True)
     for old in PAGES.glob(f"{name}-*.png"):
         old.unlink()
-    images = [figure for cell in cells for figure in cell.figures]
-    for k, image in enumerate(images, 1):
-        (PAGES / f"{name}-{k}.png").write_bytes(image)
+    figures = [figure for cell in cells for figure in cell.figures]
+    for k, figure in enumerate(figures, 1):
+        (PAGES / f"{name}-{k}.png").write_bytes(figure.png)
     (PAGES / f"{name}.md").write_text(page(name, cells), encoding="utf-8", newline="\n")
 
 
@@ -112,20 +121,15 @@ def page(name: str, cells: list[Cell]) -> str:
         parts.append(f"```python\n{cell.source}\n```\n")
         if cell.printed.strip():
             parts.append(f"```text\n{cell.printed.rstrip()}\n```\n")
-        for _ in cell.figures:
+        for figure in cell.figures:
             number += 1
-            parts.append(f"![Figure {number}: {_title(cell.source)}]({name}-{number}.png)\n")
+            parts.append(f"![Figure {number}: {figure.title}]({name}-{number}.png)\n")
     return "\n".join(parts)
 
 
 def source_of(text: str) -> list[str]:
     """Return the code cells that a page shows."""
     return re.findall(r"^```python\n(.*?)\n```$", text, re.S | re.M)
-
-
-def _title(source: str) -> str:
-    found = re.findall(r'title=f?"([^"]*)"', source) + re.findall(r'_title\(f?"([^"]*)"', source)
-    return "; ".join(found) or "see the code above"
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def test_what_is_printed_and_drawn_is_kept(render):
     ]
     done = render["execute"](cells)
     assert done[1].printed == "hello\n3\n"
-    assert done[2].figures[0].startswith(b"\x89PNG")
+    assert done[2].figures[0].png.startswith(b"\x89PNG")
     page = render["page"]("demo", done)
     assert render["source_of"](page) == [cells[1].source, cells[2].source]
     assert "```text\nhello\n3\n```" in page
