@@ -16,11 +16,15 @@ from posmas_fmi.cosim import native
 from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap, Whole
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.about import About
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.model import element_names
+from posmas_fmi.fmu.units import Conversion
 
 log = logging.getLogger(__name__)
 
-__all__ = ["FmuPlant", "PlantSpec", "PortMap"]
+__all__ = ["FmuPlant", "PlantSpec", "PortMap", "converted"]
 
 
 @attrs.frozen(eq=False)
@@ -73,7 +77,7 @@ class FmuPlant:
     Raises
     ------
     InputError
-        If a port names a variable that the FMU does not have, or with another unit.
+        If a port names a variable that the FMU does not have, or its unit does not fit.
     FmuError
         If an FMU cannot be loaded or initialised.
     """
@@ -81,16 +85,25 @@ class FmuPlant:
     def __init__(self, specs: Sequence[PlantSpec], shows_states: bool, stop: float) -> None:
         self.shows_states = shows_states
         self.names = tuple(spec.name for spec in specs)
-        self._specs = tuple(specs)
         library = _compiled_loop()
         messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
             paths = dict.fromkeys(spec.fmu for spec in specs)
             files = {path: stack.enter_context(FmuFile(path, messages)) for path in paths}
-            for fmu, ports in dict.fromkeys(
-                (spec.fmu, ports) for spec in specs for ports in (spec.inputs, spec.readings)
-            ):
-                _check_ports(files[fmu], ports)
+            known = {
+                (fmu, ports): converted(files[fmu].about, ports)
+                for fmu, ports in dict.fromkeys(
+                    (spec.fmu, ports) for spec in specs for ports in (spec.inputs, spec.readings)
+                )
+            }
+            specs = self._specs = tuple(
+                attrs.evolve(
+                    spec,
+                    inputs=known[spec.fmu, spec.inputs],
+                    readings=known[spec.fmu, spec.readings],
+                )
+                for spec in specs
+            )
             self._instances = [
                 stack.enter_context(_start(files[spec.fmu], spec, stop)) for spec in specs
             ]
@@ -201,19 +214,39 @@ def _start(file: FmuFile, spec: PlantSpec, stop: float) -> FmuInstance:
     return instance
 
 
-def _check_ports(file: FmuFile, ports: PortMap) -> None:
-    for name, unit in zip(ports.variables, ports.units, strict=True):
+def converted(about: About, ports: PortMap) -> PortMap:
+    """Return ports whose scale and offset convert units as well.
+
+    Parameters
+    ----------
+    about : About
+        The FMU.
+    ports : PortMap
+
+    Raises
+    ------
+    InputError
+        If there is no such variable, it is no number, or the units do not fit.
+    """
+    scale, offset = [], []
+    for name, unit, factor, shift in zip(
+        ports.variables, ports.units, ports.scale, ports.offset, strict=True
+    ):
         try:
-            file.ports([name])
+            size = len(about.ports([name]).names)
+            if size != 1:
+                raise InputError(
+                    f"{about.path.name}: {name!r} is an array of {size}; name one of its elements, "
+                    f"as {next(element_names(name, about.variable(name).shape))!r}"
+                )
+            found = Conversion() if unit is None else about.conversion(name, unit)
         except FmuError as error:
-            raise InputError(f"{file.path.name}: {error.message}", ports.place) from None
-        declared = file.variable(name).unit
-        if unit is not None and unit != declared:
-            raise InputError(
-                f"{file.path.name}: {name!r} is in {declared or 'no unit'} (got {unit!r}); "
-                "correct the unit, and scale and offset with it",
-                ports.place,
-            )
+            raise InputError(f"{about.path.name}: {error.message}", ports.place) from None
+        except InputError as error:
+            raise InputError(error.message, ports.place) from None
+        scale.append(found.scale * factor)
+        offset.append(found.scale * shift + found.offset)
+    return attrs.evolve(ports, scale=tuple(scale), offset=tuple(offset), units=(None,) * len(scale))
 
 
 def _existing(file: FmuFile, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,7 +30,8 @@ class PortMap:
     variables : tuple of str
     scale, offset : tuple of float
     units : tuple of (str or None)
-        Checked against the FMU's description where given.
+        In which scale × value + offset is; it is converted to that of the FMU's variable. None:
+        to be taken as it is.
     place : str
         Where in the scenario they are declared.
     """

@@ -6,20 +6,20 @@ import ctypes
 import os
 import tempfile
 import weakref
-from collections.abc import Iterable, Mapping
-from functools import cached_property
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
-from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, InputError
+from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError
+from posmas_fmi.fmu.about import About, Kind, read_description
 from posmas_fmi.fmu.archive import is_file_name, unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
 from posmas_fmi.fmu.units import Conversion, Units
-from posmas_fmi.fmu.variables import Ports, Variable, Variables
+from posmas_fmi.fmu.variables import Ports, Variable
 
 
 class FmuFile:
@@ -39,6 +39,8 @@ class FmuFile:
     Attributes
     ----------
     path : Path
+    about : About
+        What the file says about itself.
     version : {2, 3}
         FMI version.
     token : str
@@ -65,7 +67,7 @@ class FmuFile:
     and the temporary folder. What is forgotten is released when the object is collected.
     """
 
-    kind = "Co-Simulation"
+    kind: Kind = "Co-Simulation"
 
     def __init__(
         self,
@@ -97,31 +99,18 @@ class FmuFile:
         )
 
     def _open(self, folder: Path) -> None:
-        import fmpy
-
         where = str(self.path)
-        try:
-            description = fmpy.read_model_description(str(folder), validate=False)
-        except Exception as error:  # FMPy and lxml raise many kinds
-            raise ArchiveError(f"cannot read modelDescription.xml: {error}", where) from error
-        if description.fmiVersion != "2.0" and not description.fmiVersion.startswith("3."):
-            raise FmuError(f"expected FMI 2.0 or 3.0 (got {description.fmiVersion})", where)
-        interface = self._interface(description)
+        self.about = About.of(self.path, read_description(folder, self.path), self.kind)
+        interface = self.about.interface
         if interface is None:
             raise FmuError(f"expected a {self.kind} interface (it has none)", where)
-        self.version: Literal[2, 3] = 2 if description.fmiVersion == "2.0" else 3
-        self.description = description
-        self.token = str(description.guid)
-        self.variables: Mapping[str, Variable] = {
-            v.name: v for v in map(Variable.read, description.modelVariables)
-        }
-        self._variables = Variables(self.variables, where)
+        self.version = self.about.version
+        self.description = self.about.description
+        self.token = str(self.description.guid)
+        self.variables = self.about.variables
+        self._variables = self.about.names
         self.folder = folder
         self._load(str(interface.modelIdentifier))
-
-    def _interface(self, description: Any) -> Any:
-        """Return what the description says about the interface used; None if it has none."""
-        return description.coSimulation
 
     def _binding(self) -> Any:
         """Return FMPy's class for the binary."""
@@ -262,12 +251,12 @@ class FmuFile:
         FmuError
             If there is none; the message names the nearest one.
         """
-        return self._variables.resolve(name)[0]
+        return self.about.variable(name)
 
-    @cached_property
+    @property
     def units(self) -> Units:
         """The units that the file defines."""
-        return Units.read(self.description)
+        return self.about.units
 
     def conversion(self, name: str, unit: str) -> Conversion:
         """Return how a value in that unit becomes one of the variable of that name.
@@ -279,15 +268,11 @@ class FmuFile:
         InputError
             If the units do not fit; see `posmas_fmi.fmu.units.Units.conversion`.
         """
-        variable = self.variable(name)
-        try:
-            return self.units.conversion(unit, variable.unit, relative=variable.relative)
-        except InputError as error:
-            raise InputError(f"{self.path.name}: {name!r}: {error.message}") from None
+        return self.about.conversion(name, unit)
 
     def ports(self, names: Iterable[str]) -> Ports:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""
         key = tuple(names)
         if key not in self._known_ports:
-            self._known_ports[key] = self._variables.ports(key, self.version)
+            self._known_ports[key] = self.about.ports(key)
         return self._known_ports[key]

@@ -29,9 +29,6 @@ class ModelExchangeFile(FmuFile):
 
     kind = "Model Exchange"
 
-    def _interface(self, description: Any) -> Any:
-        return description.modelExchange
-
     def _binding(self) -> Any:
         from fmpy.fmi2 import FMU2Model
         from fmpy.fmi3 import FMU3Model

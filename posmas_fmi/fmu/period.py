@@ -7,6 +7,7 @@ from typing import Any
 
 import attrs
 
+from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.file import FmuFile
 
 _SAME = 1e-9  # relative: periods that are equal but for the rounding of what was written
@@ -48,7 +49,7 @@ class PeriodCheck:
     nearest: float | None = None
 
 
-def default_experiment(file: FmuFile) -> Experiment:
+def default_experiment(file: FmuFile | About) -> Experiment:
     """Return what the FMU proposes."""
     given = file.description.defaultExperiment
     if given is None:
@@ -61,12 +62,12 @@ def default_experiment(file: FmuFile) -> Experiment:
     )
 
 
-def check_period(file: FmuFile, period: float, *, last: float | None = None) -> PeriodCheck:
+def check_period(file: FmuFile | About, period: float, *, last: float | None = None) -> PeriodCheck:
     """Say whether an FMU allows a communication period.
 
     Parameters
     ----------
-    file : FmuFile
+    file : FmuFile or About
     period : float
         [s]
     last : float, optional
@@ -106,15 +107,15 @@ def check_period(file: FmuFile, period: float, *, last: float | None = None) -> 
     return PeriodCheck(True)
 
 
-def allows_steps_of_different_length(file: FmuFile) -> bool:
+def allows_steps_of_different_length(file: FmuFile | About) -> bool:
     """Return whether the communication step size may change during a run."""
     interface = _interface(file)
     return bool(getattr(interface, "canHandleVariableCommunicationStepSize", True))
 
 
-def _interface(file: FmuFile) -> Any:
-    description = file.description
-    return description.coSimulation if file.kind == "Co-Simulation" else description.modelExchange
+def _interface(file: FmuFile | About) -> Any:
+    about = file if isinstance(file, About) else file.about
+    return about.interface
 
 
 def _multiple(length: float, unit: float) -> bool:

@@ -128,19 +128,50 @@ class Units:
         if port == variable:
             return Conversion()
         outer = _parsed(port) or self.defined.get(port)
-        inner = self.defined.get(variable) or _parsed(variable)
-        for unit, name in ((outer, port), (inner, variable)):
-            if unit is None:
-                _refuse(f"the unit {name!r} is neither known nor defined by the FMU")
-        assert outer is not None
-        assert inner is not None
-        if outer.exponents != inner.exponents:
-            _refuse(
-                f"{port} ({outer.dimension}) cannot be converted to {variable} ({inner.dimension})"
-            )
-        scale = outer.factor / inner.factor
-        offset = Fraction(0) if relative else (outer.offset - inner.offset) / inner.factor
-        return Conversion(float(scale), float(offset))
+        return _converted(outer, port, self.find(variable), variable, relative)
+
+    def between(
+        self, other: Units, source: str, variable: str, *, relative: bool = False
+    ) -> Conversion:
+        """Return how a value in a unit of another FMU becomes one in a unit of this one.
+
+        Parameters
+        ----------
+        other : Units
+            Those of the other FMU.
+        source, variable : str
+            Unit there, and unit here.
+        relative : bool
+            As for `conversion`.
+
+        Raises
+        ------
+        InputError
+            If a unit is not known, or the dimensions differ.
+        """
+        outer, inner = other.find(source), self.find(variable)
+        if source == variable and outer == inner:
+            return Conversion()
+        return _converted(outer, source, inner, variable, relative)
+
+    def find(self, name: str) -> Unit | None:
+        """Return the unit of that name as the FMU defines it, else in the usual notation."""
+        return self.defined.get(name) or _parsed(name)
+
+
+def _converted(
+    outer: Unit | None, port: str, inner: Unit | None, variable: str, relative: bool
+) -> Conversion:
+    for unit, name in ((outer, port), (inner, variable)):
+        if unit is None:
+            _refuse(f"the unit {name!r} is neither known nor defined by the FMU")
+    assert outer is not None
+    assert inner is not None
+    if outer.exponents != inner.exponents:
+        _refuse(f"{port} ({outer.dimension}) cannot be converted to {variable} ({inner.dimension})")
+    scale = outer.factor / inner.factor
+    offset = Fraction(0) if relative else (outer.offset - inner.offset) / inner.factor
+    return Conversion(float(scale), float(offset))
 
 
 def _refuse(what: str) -> NoReturn:

@@ -22,7 +22,7 @@ from posmas_fmi.expression import Array, VectorFunction, parse
 from posmas_fmi.network import Network, network_from_arcs, read_adjacency
 from posmas_fmi.scenario.faults import make_episodes
 from posmas_fmi.scenario.reading import read_tables
-from posmas_fmi.scenario.signals import Signal, Signals, read_signal
+from posmas_fmi.scenario.signals import Columns, Signal, Signals, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
     ChannelTable,
@@ -36,6 +36,7 @@ from posmas_fmi.scenario.tables import (
     ScenarioFile,
     ScenarioTable,
     SensorTable,
+    SignalTable,
     Uniform,
 )
 
@@ -72,8 +73,8 @@ class Scenario:
         Communication points at which the leader goes on from another state.
     signals : Signals or None
         From outside.
-    signal_columns : dict of str to (int, int)
-        First column and number of columns of each signal.
+    signal_columns : dict of str to Columns
+        Where each signal stands.
     path : Path
         The file.
     inputs : tuple of Path
@@ -100,7 +101,7 @@ class Scenario:
     sensors: Sensors | None
     jumps: tuple[tuple[int, Array], ...]
     signals: Signals | None
-    signal_columns: dict[str, tuple[int, int]]
+    signal_columns: dict[str, Columns]
     path: Path
     inputs: tuple[Path, ...]
     text: str
@@ -254,7 +255,7 @@ class _Builder:
             sensors=sensors,
             jumps=jumps or (),
             signals=Signals(tuple(made.values()), clock) if made else None,
-            signal_columns=_columns(made),
+            signal_columns=_columns(made, tables.signals),
             path=self.path,
             inputs=self.inputs(),
             text=self.text,
@@ -296,11 +297,11 @@ class _Builder:
             self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
 
 
-def _columns(signals: dict[str, Signal]) -> dict[str, tuple[int, int]]:
-    """First column and number of columns of each signal, side by side."""
+def _columns(signals: dict[str, Signal], tables: dict[str, SignalTable]) -> dict[str, Columns]:
+    """Where each signal stands, side by side."""
     first, columns = 0, {}
     for name, signal in signals.items():
-        columns[name] = (first, signal.values.shape[1])
+        columns[name] = Columns(first, signal.values.shape[1], tables[name].unit)
         first += signal.values.shape[1]
     return columns
 

@@ -12,6 +12,7 @@ from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.cosim.wiring import Whole, Wiring
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.expression import VectorFunction
+from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
@@ -115,25 +116,30 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
     Raises
     ------
     InputError
-        If ports are missing, or what is wired to what is not clear.
+        If ports are missing, do not fit an FMU or its units, or what is wired to what is not clear.
     """
     plant, N = scenario.plant, scenario.network.N
+    abouts = {path: read_about(path) for path in dict.fromkeys(files)}
     shows_states = _shows_states(scenario)
-    agents = [_agent_instance(scenario, k, path, shows_states) for k, path in enumerate(files[:N])]
+    agents = [
+        _agent_instance(scenario, k, abouts[path], shows_states)
+        for k, path in enumerate(files[:N])
+    ]
     nothing = PortMap.plain(())
     components = [
-        Instance(table.name, path, table.parameters, nothing, nothing, table.tolerance)
+        Instance(table.name, abouts[path], table.parameters, nothing, nothing, table.tolerance)
         for table, path in zip(scenario.components, files[N:], strict=True)
     ]
-    signals, first = scenario.signals, scenario.signal_columns
-    wires = Wires(agents, components, first)
+    wires = Wires(agents, components, scenario.signal_columns)
     for k in range(N):
         wires.exogenous(k, plant.exogenous, "$.plant.exogenous")
     for k, table in enumerate(scenario.components):
         wires.exogenous(N + k, table.exogenous, f"$.component[{k}].exogenous")
     for k, connection in enumerate(scenario.connections):
         wires.connect(connection, f"$.connection[{k}]")
-    wiring, recorded = wires.wiring(plant.record, [c.record for c in scenario.components], signals)
+    wiring, recorded = wires.wiring(
+        plant.record, [c.record for c in scenario.components], scenario.signals
+    )
     return Instances(
         tuple(one.spec() for one in (*agents, *components)),
         wiring,
@@ -144,14 +150,14 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
     )
 
 
-def _agent_instance(scenario: Scenario, k: int, path: Path, shows_states: bool) -> Instance:
+def _agent_instance(scenario: Scenario, k: int, about: About, shows_states: bool) -> Instance:
     agent, own = scenario.agent, _override(scenario, k)
     readings = _ports(scenario, "outputs", agent.q, own)
     if shows_states:
         readings = readings + _ports(scenario, "states", agent.m, own)
     return Instance(
         scenario.network.names[k],
-        path,
+        about,
         _values(scenario, k),
         _ports(scenario, "inputs", agent.p, own),
         readings,

@@ -49,6 +49,22 @@ class Signal:
         return np.asarray(self.values[np.maximum(place, 0)])
 
 
+@attrs.frozen
+class Columns:
+    """Where a signal stands among all.
+
+    Attributes
+    ----------
+    first, count : int
+        First column and number of columns.
+    unit : str or None
+    """
+
+    first: int
+    count: int
+    unit: str | None = None
+
+
 @attrs.frozen(eq=False)
 class Signals:
     """All signals of a scenario side by side; implements `posmas_fmi.cosim.wiring.Drive`.

@@ -108,7 +108,7 @@ class Port:
     scale, offset : float
         FMU value = scale × protocol value + offset.
     unit : str, optional
-        The FMU variable's unit, checked against its description.
+        In which that is; it is converted to the unit of the FMU's variable.
     """
 
     variable: str
@@ -190,6 +190,8 @@ class SignalTable:
         Which columns; one, or one for each agent. Default: all but the time.
     scale, offset : float
         Signal = scale × what stands in the file + offset.
+    unit : str, optional
+        In which the signal is; it is converted to that of the input that follows it.
     interpolation : {"hold", "linear"}
         Between two times of the file. A signal is held over a communication step in any case.
     """
@@ -199,6 +201,7 @@ class SignalTable:
     columns: list[str] = attrs.field(factory=list)
     scale: float = 1.0
     offset: float = 0.0
+    unit: str | None = None
     interpolation: Literal["hold", "linear"] = "hold"
 
 
@@ -243,15 +246,15 @@ class ConnectionTable:
         ``{agent}`` in a variable stands for the agent's number.
     sum : bool
         Whether an input is the sum over all agents.
-    scale, offset : float
-        Input = scale × source + offset.
+    scale, offset : float, optional
+        Input = scale × source + offset. Where neither is given, units are converted or refused.
     """
 
     source: str
     to: str
     sum: bool = False
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float | None = None
+    offset: float | None = None
 
 
 @attrs.frozen

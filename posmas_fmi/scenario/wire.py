@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 import numpy as np
 
-from posmas_fmi.cosim.fmu_plant import PlantSpec, PortMap
+from posmas_fmi.cosim.fmu_plant import PlantSpec, PortMap, converted
 from posmas_fmi.cosim.wiring import Extra, NoDrive, Term, Wiring, column
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.scenario.signals import Signals
+from posmas_fmi.fmu.about import About, fitted
+from posmas_fmi.fmu.units import Conversion
+from posmas_fmi.scenario.signals import Columns, Signals
 from posmas_fmi.scenario.tables import ConnectionTable
 
 AGENTS = "agents"
@@ -26,7 +27,8 @@ class Instance:
     Attributes
     ----------
     name : str
-    fmu : Path
+    about : About
+        Its FMU.
     values : mapping
     inputs, readings : PortMap
         Those of the protocol; more are added.
@@ -38,13 +40,22 @@ class Instance:
     """
 
     name: str
-    fmu: Path
+    about: About
     values: Mapping[str, Any]
     inputs: PortMap
     readings: PortMap
     tolerance: float | None = None
     extras: dict[str, Extra] = attrs.field(factory=dict)
     more: list[str] = attrs.field(factory=list)
+
+    def check(self, variable: str, place: str) -> None:
+        """Refuse what is no single number of the FMU.
+
+        Raises
+        ------
+        InputError
+        """
+        converted(self.about, PortMap.plain((variable,), place))
 
     def wants(self, variable: str) -> int:
         """Place of a variable among the readings, which it is added to if need be."""
@@ -67,11 +78,11 @@ class Instance:
     def spec(self) -> PlantSpec:
         """Return the definition of the instance."""
         return PlantSpec(
-            self.fmu,
+            self.about.path,
             self.values,
             self.name,
-            self.inputs + PortMap.plain(tuple(self.extras)),
-            self.readings + PortMap.plain(tuple(self.more)),
+            converted(self.about, self.inputs) + PortMap.plain(tuple(self.extras)),
+            converted(self.about, self.readings) + PortMap.plain(tuple(self.more)),
             self.tolerance,
         )
 
@@ -101,6 +112,14 @@ class Recorded:
         return rest | agents | {name: extra[:, at] for name, at in self.of_components.items()}
 
 
+def _placed(make: Callable[[], Conversion], place: str) -> Conversion:
+    """Give errors of a conversion their place."""
+    try:
+        return make()
+    except (FmuError, InputError) as error:
+        raise InputError(error.message, place) from None
+
+
 @attrs.frozen
 class _Reading:
     instance: int
@@ -113,21 +132,21 @@ class Wires:
     Parameters
     ----------
     agents, components : list of Instance
-    first_column : mapping of str to (int, int)
-        First column and number of columns of each signal.
+    columns : mapping of str to Columns
+        Where each signal stands.
     """
 
     def __init__(
         self,
         agents: list[Instance],
         components: list[Instance],
-        first_column: Mapping[str, tuple[int, int]],
+        columns: Mapping[str, Columns],
     ) -> None:
         self._agents, self._all = agents, [*agents, *components]
-        self._columns = first_column
+        self._columns = columns
         self._number = {one.name: k for k, one in enumerate(self._all)}
         self._terms: list[tuple[int, str, list[tuple[_Reading | int, float]], float, str]] = []
-        self._recorded: list[_Reading] = []
+        self._units: dict[tuple[About, About, str, str], Conversion] = {}
 
     def exogenous(self, instance: int, inputs: Mapping[str, str], place: str) -> None:
         """Let inputs of an instance follow signals.
@@ -135,22 +154,26 @@ class Wires:
         Raises
         ------
         InputError
-            If there is no such signal, or it does not say which column is meant.
+            If there is no such signal or input, their units do not fit, or it does not say which
+            column is meant.
         """
         for variable, signal in inputs.items():
             where = f"{place}.{variable}"
             if signal not in self._columns:
                 known = ", ".join(self._columns) or "none"
                 raise InputError(f"there is no signal {signal!r} in [signals] ({known})", where)
-            first, count = self._columns[signal]
+            self._all[instance].check(variable, where)
+            found = self._columns[signal]
+            count = found.count
             if count > 1 and instance >= len(self._agents):
                 raise InputError(
                     f"the signal {signal!r} has {count} columns, one for each agent; a component "
                     "needs one of a single column",
                     where,
                 )
-            source = column(first + (instance if count > 1 else 0))
-            self._terms.append((instance, variable, [(source, 1.0)], 0.0, where))
+            source = column(found.first + (instance if count > 1 else 0))
+            unit = self._from_signal(found.unit, instance, variable, where)
+            self._terms.append((instance, variable, [(source, unit.scale)], unit.offset, where))
 
     def connect(self, table: ConnectionTable, place: str) -> None:
         """Let what some instances show be inputs of others.
@@ -158,17 +181,25 @@ class Wires:
         Raises
         ------
         InputError
-            If a name is unknown, or it is not clear which goes where.
+            If a name is unknown, units do not fit, or it is not clear which goes where.
         """
         sources, text = self._end(table.source, f"{place}.source")
         targets, to = self._end(table.to, f"{place}.to")
         n = len(self._agents)
         readings = [_Reading(k, text.replace("{agent}", str(k + 1))) for k in sources]
-        weight = table.scale
+        for reading in readings:
+            self._all[reading.instance].check(reading.variable, f"{place}.source")
 
         def add(target: int, variable: str, chosen: list[_Reading]) -> None:
-            terms: list[tuple[_Reading | int, float]] = [(r, weight) for r in chosen]
-            self._terms.append((target, variable, terms, table.offset, place))
+            self._all[target].check(variable, f"{place}.to")
+            bias, terms = 0.0 if table.offset is None else table.offset, []
+            for reading in chosen:
+                weight = 1.0 if table.scale is None else table.scale
+                if table.scale is None and table.offset is None:
+                    unit = self._unit(reading, target, variable, place)
+                    weight, bias = unit.scale, bias + unit.offset
+                terms.append((reading, weight))
+            self._terms.append((target, variable, list(terms), bias, place))
 
         if table.sum:
             if "{agent}" in to:
@@ -190,6 +221,23 @@ class Wires:
                 "name",
                 f"{place}.to",
             )
+
+    def _from_signal(
+        self, unit: str | None, instance: int, variable: str, place: str
+    ) -> Conversion:
+        if unit is None:
+            return Conversion()
+        return _placed(lambda: self._all[instance].about.conversion(variable, unit), place)
+
+    def _unit(self, source: _Reading, target: int, variable: str, place: str) -> Conversion:
+        """How what is read becomes the input; asked once for equal FMUs."""
+        ends = (self._all[source.instance].about, self._all[target].about)
+        key = (*ends, source.variable, variable)
+        if key not in self._units:
+            self._units[key] = _placed(
+                lambda: fitted((ends[0], source.variable), (ends[1], variable)), place
+            )
+        return self._units[key]
 
     def _end(self, text: str, place: str) -> tuple[list[int], str]:
         name, dot, variable = text.partition(".")
@@ -226,6 +274,10 @@ class Wires:
             _Reading(n + k, name) for k, names in enumerate(component_record) for name in names
         ]
         recorded = [*wanted, *of_component]
+        for reading in recorded:
+            k = reading.instance - n
+            place_of = "$.plant.record" if k < 0 else f"$.component[{k}].record"
+            self._all[reading.instance].check(reading.variable, place_of)
         local: dict[_Reading, int] = {}
         in_terms = [s for _, _, terms, _, _ in self._terms for s, _ in terms]
         for reading in (*recorded, *(s for s in in_terms if isinstance(s, _Reading))):

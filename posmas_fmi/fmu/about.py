@@ -1,0 +1,169 @@
+"""What an FMU says about itself, read without loading its binary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import attrs
+
+from posmas_fmi.errors import ArchiveError, FmuError, InputError
+from posmas_fmi.fmu.archive import examine
+from posmas_fmi.fmu.units import Conversion, Units
+from posmas_fmi.fmu.variables import Ports, Variable, Variables
+
+Kind = Literal["Co-Simulation", "Model Exchange"]
+
+
+@attrs.frozen(eq=False, slots=False)
+class About:
+    """What an FMU says about itself.
+
+    Attributes
+    ----------
+    path : Path
+    version : {2, 3}
+        FMI version.
+    description : fmpy ModelDescription
+        All of it.
+    kind : {"Co-Simulation", "Model Exchange"}
+        How it is run; Co-Simulation where it offers both.
+    names : Variables
+    """
+
+    path: Path
+    version: Literal[2, 3]
+    description: Any
+    kind: Kind
+    names: Variables
+
+    @classmethod
+    def of(cls, path: Path, description: Any, kind: Kind | None = None) -> About:
+        """Take over FMPy's model description of the file `path`.
+
+        Raises
+        ------
+        FmuError
+            If it is not of FMI 2.0 or 3.
+        """
+        where, told = str(path), description.fmiVersion
+        if told != "2.0" and not told.startswith("3."):
+            raise FmuError(f"expected FMI 2.0 or 3.0 (got {told})", where)
+        if kind is None:
+            kind = "Co-Simulation" if description.coSimulation else "Model Exchange"
+        variables = {v.name: v for v in map(Variable.read, description.modelVariables)}
+        version: Literal[2, 3] = 2 if told == "2.0" else 3
+        return cls(path, version, description, kind, Variables(variables, where))
+
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """By name."""
+        return self.names.by_name
+
+    @property
+    def interface(self) -> Any:
+        """What the description says about the interface of this kind; None if it has none."""
+        told = self.description
+        return told.coSimulation if self.kind == "Co-Simulation" else told.modelExchange
+
+    @cached_property
+    def units(self) -> Units:
+        """The units that it defines."""
+        return Units.read(self.description)
+
+    def variable(self, name: str) -> Variable:
+        """Return the variable of that name, or the array that has that element (``u[1]``).
+
+        Raises
+        ------
+        FmuError
+            If there is none; the message names the nearest one.
+        """
+        return self.names.resolve(name)[0]
+
+    def conversion(self, name: str, unit: str) -> Conversion:
+        """Return how a value in that unit becomes one of the variable of that name.
+
+        Raises
+        ------
+        FmuError
+            If there is no such variable.
+        InputError
+            If the units do not fit; see `posmas_fmi.fmu.units.Units.conversion`.
+        """
+        variable = self.variable(name)
+        try:
+            return self.units.conversion(unit, variable.unit, relative=variable.relative)
+        except InputError as error:
+            raise InputError(f"{self.path.name}: {name!r}: {error.message}") from None
+
+    def ports(self, names: Iterable[str]) -> Ports:
+        """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""
+        return self.names.ports(names, self.version)
+
+
+def read_about(path: Path) -> About:
+    """Read what an FMU says about itself; nothing is unpacked or loaded.
+
+    Raises
+    ------
+    ArchiveError
+        If the archive is unsafe, or its description cannot be read.
+    FmuError
+        If it is not of FMI 2.0 or 3.
+    """
+    for finding in examine(path):
+        if finding.severity == "fatal":
+            inside = f"{finding.place}: " if finding.place else ""
+            raise ArchiveError(f"{inside}{finding.message}", str(path))
+    return About.of(path, read_description(path, path))
+
+
+def read_description(place: Path, path: Path) -> Any:
+    """Return FMPy's model description of an archive or folder; errors are about the file `path`.
+
+    Raises
+    ------
+    ArchiveError
+    """
+    import fmpy
+
+    try:
+        return fmpy.read_model_description(str(place), validate=False)
+    except Exception as error:  # FMPy and lxml raise many kinds
+        raise ArchiveError(f"cannot read modelDescription.xml: {error}", str(path)) from error
+
+
+def fitted(source: tuple[About, str], target: tuple[About, str]) -> Conversion:
+    """Return how a value of one FMU's variable becomes one of another FMU's.
+
+    Parameters
+    ----------
+    source, target : (About, str)
+        The FMU and the name of its variable.
+
+    Raises
+    ------
+    InputError
+        If one has a unit and the other has none, or the units do not fit.
+    """
+    ends = [(about, about.variable(name)) for about, name in (source, target)]
+    outer, inner = (variable for _, variable in ends)
+    try:
+        if outer.unit is None and inner.unit is None:
+            return Conversion()
+        if outer.unit is None or inner.unit is None:
+            raise InputError("only one of them has a unit")
+        if outer.relative != inner.relative:
+            raise InputError("one of them is a difference (relativeQuantity), the other is not")
+        return ends[1][0].units.between(
+            ends[0][0].units, outer.unit, inner.unit, relative=inner.relative
+        )
+    except InputError as error:
+        why = error.message.partition("; leave the unit out")[0]
+        raise InputError(
+            f"{source[1]!r} of {source[0].path.name} ({outer.unit or 'no unit'}) to {target[1]!r} "
+            f"of {target[0].path.name} ({inner.unit or 'no unit'}): {why}; give scale and offset"
+        ) from None
