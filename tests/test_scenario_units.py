@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 from fmu_examples import TANK_C, TANK_TOML
@@ -11,9 +12,10 @@ from test_scenario_wiring import LOADS, ROW
 
 from posmas_fmi import load, run
 from posmas_fmi.errors import InputError
-from posmas_fmi.fmu.about import fitted, read_about
+from posmas_fmi.fmu.about import About, fitted, read_about
 from posmas_fmi.fmu.build import fmu
 from posmas_fmi.fmu.plant import read_plant
+from posmas_fmi.fmu.units import Conversion
 from posmas_fmi.scenario.plant import fmu_files, make_instances
 
 
@@ -55,11 +57,6 @@ def test_a_run_in_other_units_is_the_same_run(folder: Path) -> None:
 
 WRONG = {
     "port": (("offset = 305.15}", 'unit = "kg/s"}'), "$.plant.outputs", "cannot be converted to K"),
-    "no unit": (
-        ("scale = 0.01, offset = 0.7}", 'unit = "%"}'),
-        "$.plant.inputs",
-        "does not say in which unit",
-    ),
     "signal": (
         ("scale = 1e3", 'scale = 1e3\nunit = "K"'),
         "$.plant.exogenous.heat_load",
@@ -69,11 +66,6 @@ WRONG = {
         ('source = "agents.primary_heat_flow"', 'source = "agents.supply_temperature"'),
         "$.connection[1]",
         "cannot be converted to W (kg.m2.s-3); give scale and offset",
-    ),
-    "one has none": (
-        ('source = "agents.primary_heat_flow"', 'source = "agents.valve_position"'),
-        "$.connection[1]",
-        "only one of them has a unit; give scale and offset",
     ),
     "source": (('"agents.kv"', '"agents.kw"'), "$.connection[0].source", "no variable 'kw'"),
     "input": (('"agents.header"', '"agents.heder"'), "$.connection[2].to", "did you mean 'header'"),
@@ -103,23 +95,24 @@ def test_a_connection_with_scale_is_the_users(folder: Path) -> None:
     assert extra.bias == 1.0
 
 
-def celsius(folder: Path) -> Path:
-    """The tank, which says that its temperature is in degC and its power in kW."""
-    folder.mkdir()
-    text = TANK_TOML.replace('unit = "K"', 'unit = "degC"').replace(
-        'start = 100.0\nunit = "W"', 'start = 100.0\nunit = "kW"'
-    )
-    (folder / "model.toml").write_text(text)
-    (folder / "model.c").write_text(TANK_C)
-    return fmu(read_plant(folder), 3, cache=folder)
+def tank(folder: Path) -> About:
+    (folder / "tank").mkdir()
+    (folder / "tank" / "model.toml").write_text(TANK_TOML)
+    (folder / "tank" / "model.c").write_text(TANK_C)
+    return read_about(fmu(read_plant(folder / "tank"), 2, cache=folder))
+
+
+def in_units(about: About, **units: str | None) -> About:
+    """Return what the same FMU would say with other units."""
+    named = dict(about.variables)
+    for name, unit in units.items():
+        named[name] = attrs.evolve(named[name], unit=unit)
+    return attrs.evolve(about, names=attrs.evolve(about.names, by_name=named))
 
 
 def test_between_two_fmus(tmp_path: Path) -> None:
-    (tmp_path / "k").mkdir()
-    (tmp_path / "k" / "model.toml").write_text(TANK_TOML)
-    (tmp_path / "k" / "model.c").write_text(TANK_C)
-    kelvin = read_about(fmu(read_plant(tmp_path / "k"), 2, cache=tmp_path))
-    other = read_about(celsius(tmp_path / "c"))
+    kelvin = tank(tmp_path)
+    other = in_units(kelvin, temperature="degC", power="kW")
     there = fitted((kelvin, "temperature"), (other, "temperature"))
     assert (there.scale, there.offset) == (1.0, -273.15)
     back = fitted((other, "temperature"), (kelvin, "temperature"))
@@ -127,3 +120,11 @@ def test_between_two_fmus(tmp_path: Path) -> None:
     assert fitted((kelvin, "flow"), (other, "power")).scale == 1e-3
     with pytest.raises(InputError, match=r"'flow' of tank.*\(W\) to 'temperature'.*give scale"):
         fitted((kelvin, "flow"), (other, "temperature"))
+
+
+def test_one_unit_alone_is_not_guessed(tmp_path: Path) -> None:
+    about = tank(tmp_path)
+    bare = in_units(about, flow=None)
+    with pytest.raises(InputError, match="only one of them has a unit; give scale and offset"):
+        fitted((bare, "flow"), (about, "power"))
+    assert fitted((bare, "flow"), (bare, "flow")) == Conversion()

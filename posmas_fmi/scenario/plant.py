@@ -122,8 +122,7 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
     abouts = {path: read_about(path) for path in dict.fromkeys(files)}
     shows_states = _shows_states(scenario)
     agents = [
-        _agent_instance(scenario, k, abouts[path], shows_states)
-        for k, path in enumerate(files[:N])
+        _agent_instance(scenario, k, abouts[path], shows_states) for k, path in enumerate(files[:N])
     ]
     nothing = PortMap.plain(())
     components = [
