@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 from fmu_examples import tank_fmu
+from fmu_scenarios import one_fmu
 from test_fmu_instance import described
 
+from posmas_fmi import load, run
+from posmas_fmi.errors import ScenarioError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.period import (
     Experiment,
@@ -72,3 +75,28 @@ def test_steps_of_the_same_length(cache: Path, tmp_path: Path, fmi: int) -> None
         check = check_period(file, 0.3, last=0.1)
         assert not check.allowed
         assert "all of its communication steps have the same length" in check.reason
+
+
+@pytest.mark.parametrize(
+    ("period", "every", "message"),
+    [
+        (0.25, 1, r"steps of 0\.1 s.*the nearest is 0\.2 s"),
+        (0.02, 3, r"0\.06 s is no whole multiple.*the nearest is 0\.1 s \(every = 3\)"),
+    ],
+)
+def test_a_scenario_is_refused_before_anything_runs(
+    fixed: Path, tmp_path: Path, period: float, every: int, message: str
+) -> None:
+    more = f"[[plant.override]]\nagent = 2\nevery = {every}"
+    path = one_fmu(
+        tmp_path, fixed, '"power"', '"temperature"', more, until=300 * period, period=period
+    )
+    with pytest.raises(ScenarioError, match=message) as caught:
+        run(load(path), tmp_path / "out")
+    assert "$.scenario.period: fixed.fmu" in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scenario_with_a_period_that_is_allowed_runs(fixed: Path, tmp_path: Path) -> None:
+    path = one_fmu(tmp_path, fixed, '"power"', '"temperature"', period=0.3, until=3.0)
+    assert run(load(path), tmp_path / "out", report=False).summary["steps"] == 10

@@ -122,9 +122,9 @@ def run(
     """
     from posmas_fmi.report import write_report
 
-    designed = make_design_of(scenario)
     files = fmu_files(scenario)
     instances = make_instances(scenario, files)
+    designed = make_design_of(scenario)
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     _make_folder(folder)

@@ -14,6 +14,7 @@ from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.build import agent_fmu, fmu
+from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.tables import Override, Port
@@ -116,10 +117,13 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
     Raises
     ------
     InputError
-        If ports are missing, do not fit an FMU or its units, or what is wired to what is not clear.
+        If an FMU does not allow the period, ports are missing, do not fit an FMU or its units, or
+        what is wired to what is not clear.
     """
     plant, N = scenario.plant, scenario.network.N
     abouts = {path: read_about(path) for path in dict.fromkeys(files)}
+    every = _periods(scenario)
+    _check_periods(scenario, [abouts[path] for path in files], every)
     shows_states = _shows_states(scenario)
     agents = [
         _agent_instance(scenario, k, abouts[path], shows_states) for k, path in enumerate(files[:N])
@@ -145,7 +149,7 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
         recorded,
         shows_states,
         scenario.clock.time(scenario.clock.steps),
-        _periods(scenario),
+        every,
     )
 
 
@@ -183,6 +187,20 @@ def _periods(scenario: Scenario) -> Whole:
             )
         every[override.agent - 1] = override.every
     return every
+
+
+def _check_periods(scenario: Scenario, abouts: list[About], every: Whole) -> None:
+    """Refuse periods that an FMU does not allow."""
+    problems = []
+    for about, steps in dict.fromkeys(zip(abouts, every.tolist(), strict=True)):
+        found = check_period(about, steps * scenario.clock.h)
+        if not found.allowed:
+            text = f"{about.path.name} does not allow this period: {found.reason}"
+            if steps > 1:
+                text += f" (every = {steps})"
+            problems.append(("$.scenario.period", text))
+    if problems:
+        raise ScenarioError(tuple(problems), str(scenario.path))
 
 
 def _values(scenario: Scenario, k: int) -> dict[str, Any]:
