@@ -267,6 +267,58 @@ class _ExactC(C99CodePrinter):
         return f"(0.5*((({x}) > 0) - (({x}) < 0)) + 0.5)"
 
 
+class _LanesC(_ExactC):
+    """C code for many values at once: the types and functions of cosim/csrc/lanes.h."""
+
+    _OWN = ("sin", "cos", "exp", "tanh")  # of lanes.h; others go to math.h one by one
+
+    def lanes(self, expr: sympy.Expr) -> str:
+        """Print an expression, as lanes also where it is a number."""
+        code = str(self._print(expr))
+        return code if expr.free_symbols else f"lanes_of({code})"
+
+    def _print_Function(self, expr: sympy.Function) -> str:
+        name, args = expr.func.__name__, expr.args
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        if name in self._OWN:
+            return f"lanes_{name}({self._print(args[0])})"
+        return f"lanes_each({name}, {self._print(args[0])})"
+
+    _print_sin = _print_cos = _print_exp = _print_tanh = _print_Function
+    _print_tan = _print_atan = _print_log = _print_sinh = _print_cosh = _print_Function
+
+    def _print_Abs(self, expr: sympy.Expr) -> str:
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        return f"lanes_abs({self._print(expr.args[0])})"
+
+    def _print_sign(self, expr: sympy.Expr) -> str:
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        return f"lanes_sign({self._print(expr.args[0])})"
+
+    def _print_Min(self, expr: sympy.Expr) -> str:
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        return _nested("lanes_min", [self.lanes(arg) for arg in expr.args])
+
+    def _print_Max(self, expr: sympy.Expr) -> str:
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        return _nested("lanes_max", [self.lanes(arg) for arg in expr.args])
+
+    def _print_Pow(self, expr: sympy.Pow) -> str:
+        base, exponent = expr.args
+        if not expr.free_symbols:
+            return str(_ExactC().doprint(expr))
+        if exponent == sympy.Rational(1, 2):
+            return f"lanes_sqrt({self._print(base)})"
+        if exponent.is_Integer and (exponent == -1 or 2 <= exponent <= 4):
+            return str(super()._print_Pow(expr))
+        return f"lanes_pow({self.lanes(base)}, {self.lanes(exponent)})"
+
+
 @attrs.frozen
 class VectorFunction:
     """Expressions in common variables: one function in every form that this project needs.
@@ -333,7 +385,7 @@ class VectorFunction:
 
         return evaluate
 
-    def c_code(self, target: str, names: dict[str, str]) -> str:
+    def c_code(self, target: str, names: dict[str, str], lanes: bool = False) -> str:
         """Return C statements that assign the components to ``target[k]``.
 
         Parameters
@@ -342,14 +394,16 @@ class VectorFunction:
             Name of a C array of doubles.
         names : dict
             C expression for each variable.
+        lanes : bool
+            For many values at once: ``Lanes`` of cosim/csrc/lanes.h instead of ``double``.
         """
-        printer = _ExactC()
+        printer = _LanesC() if lanes else _ExactC()
+        put = printer.lanes if isinstance(printer, _LanesC) else printer.doprint
+        kind = "Lanes" if lanes else "double"
         place = {symbol(v): sympy.Symbol(c) for v, c in names.items()}
         shared, reduced = sympy.cse(
             list(self.expressions), symbols=sympy.numbered_symbols(f"{target}_"), order="none"
         )
-        lines = [f"const double {s} = {printer.doprint(e.xreplace(place))};" for s, e in shared]
-        lines += [
-            f"{target}[{k}] = {printer.doprint(e.xreplace(place))};" for k, e in enumerate(reduced)
-        ]
+        lines = [f"const {kind} {s} = {put(e.xreplace(place))};" for s, e in shared]
+        lines += [f"{target}[{k}] = {put(e.xreplace(place))};" for k, e in enumerate(reduced)]
         return "\n".join(lines)

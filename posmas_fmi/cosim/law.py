@@ -238,7 +238,7 @@ class ProtocolLaw(CompiledLaw):
             raise InputError(
                 "g and sec are Python functions; the engine needs expressions", "$.scenario.engine"
             )
-        header = functions_header(agent.g, agent.sec, agent.m, agent.p, agent.q, slopes=False)
+        header = functions_header(agent.g, agent.sec, agent.m, agent.p, agent.q, lanes=True)
         return engine_sources("protocol", header)
 
     def constants(self, h: float) -> Array:

@@ -22,7 +22,7 @@ from posmas_fmi.fmu.positive_agent import functions_header
 _HERE = Path(__file__).parent / "csrc"
 _EXPORT = Path(resources.__file__).parent / "fmu" / "csrc" / "export.h"
 _FMUS = ("fmus.h", "fmus.c", "message_log.h", "message_log.c")
-_ENGINE = ("engine.h", "engine.c", "threads.h", "threads.c", "controllers.c")
+_ENGINE = ("engine.h", "engine.c", "threads.h", "threads.c", "controllers.c", "lanes.h")
 _MORE_FLAGS = ("-O3", "-pthread")  # of the engine: unrolls the small matrix products
 
 
@@ -153,7 +153,7 @@ def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:
             raise BuildError(f"cannot read the scenario: {error}", str(file)) from error
         if isinstance(agent, dict):
             functions = agent_functions(agent, f"{file}: $.agent")
-            wanted.append(engine_sources("protocol", functions_header(*functions, slopes=False)))
+            wanted.append(engine_sources("protocol", functions_header(*functions, lanes=True)))
     paths: list[Path] = []
     for sources in wanted:
         path = out_dir / sources.file_name

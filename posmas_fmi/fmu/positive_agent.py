@@ -112,9 +112,11 @@ def _check(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -> No
 
 
 def functions_header(
-    g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int, slopes: bool = True
+    g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int, lanes: bool = False
 ) -> str:
     """Return ``agent_functions.h``: the sizes M, P, Q, g and sec in C, and their slopes.
+
+    With `lanes` g and sec are those of many agents at once, for the engine, without slopes.
 
     Raises
     ------
@@ -122,6 +124,8 @@ def functions_header(
         If g or sec do not fit the sizes, or component k of sec depends on another input.
     """
     _check(g, sec, m, p, q)
+    if lanes:
+        return _lanes_header(g, sec, m, p, q)
     states = {"t": "t"} | {f"x{k + 1}": f"x[{k}]" for k in range(m)}
     inputs = {f"u{k + 1}": f"u[{k}]" for k in range(p)}
     own_slopes = tuple(
@@ -148,8 +152,6 @@ def functions_header(
             inputs,
         ),
     ]
-    if not slopes:
-        parts = [part for part in parts if part[3] != "slope"]
     lines = [
         "/* g and sec of model (1) and their slopes, generated from the agent's expressions. */",
         "#ifndef AGENT_FUNCTIONS_H",
@@ -165,6 +167,30 @@ def functions_header(
         lines += [f"    (void){argument};" for argument in unused]
         lines += [f"    {line}" for line in body] + ["}"]
     return "\n".join([*lines, "", "#endif", ""])
+
+
+def _lanes_header(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int) -> str:
+    states = {"t": "t"} | {f"x{k + 1}": f"x[{k}]" for k in range(m)}
+    inputs = {f"u{k + 1}": f"u[{k}]" for k in range(p)}
+    lines = [
+        "/* g and sec of model (1) for the agents of all lanes, generated from the expressions. */",
+        "#ifndef AGENT_FUNCTIONS_H",
+        "#define AGENT_FUNCTIONS_H",
+        "",
+        f"enum {{ M = {m}, P = {p}, Q = {q} }};",
+        "",
+        "#ifdef LANES",
+        '#include "lanes.h"',
+    ]
+    for name, arguments, unused, target, function, names in (
+        ("agent_g", "Lanes t, const Lanes *x", ("t", "x"), "g", g, states),
+        ("agent_sec", "const Lanes *u", ("u",), "sec", sec, inputs),
+    ):
+        lines += ["", f"LANES_INLINE void {name}({arguments}, Lanes *{target})", "{"]
+        lines += [f"    (void){argument};" for argument in unused]
+        lines += [f"    {line}" for line in function.c_code(target, names, True).splitlines()]
+        lines += ["}"]
+    return "\n".join([*lines, "#endif", "", "#endif", ""])
 
 
 def _almost_everywhere(function: VectorFunction) -> VectorFunction:

@@ -272,19 +272,102 @@ static int ends(const Engine *e, int64_t k, int64_t i)
     return !e->frozen[i] && (k + 1) % e->every[i] == 0;
 }
 
-/* The input of agent i at a point, and what its controller remembers next. */
-static void control(const Engine *e, const Point *p, int64_t i, double t)
+/* What agent i remembers at the next point goes here: at once, or when its period is over. */
+static double *remembers(const Engine *e, const Point *p, int64_t i)
 {
-    double disagreement[MESSAGE], silence[2];
-    double *u = e->u + i * P, *actuated = e->actuated + i * P;
-    double *next = e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
-    gather(e, p, i, disagreement, silence);
-    controller_step(controller(e, i), own_values(e, i), t, measured(e, p->k, i), disagreement,
-                    silence, memory(e, p->k, i), next, u, e->applied + i * P);
+    return e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
+}
+
+/* What the actuator of agent i makes of its input. */
+static void actuate(const Engine *e, const Point *p, int64_t i)
+{
+    const double *u = e->u + i * P;
+    double *actuated = e->actuated + i * P;
     for (int j = 0; j < P; j++) {
         const double gain = e->actuator_gain && p->k > 0 ? e->actuator_gain[i * P + j] : 1;
         actuated[j] = gain == 1 ? u[j] : actuated[j] + gain * (u[j] - actuated[j]);
     }
+}
+
+#if defined CONTROLLER_BLOCK
+
+/* Column `at` of a matrix with CONTROLLER_BLOCK columns, from and to the values of one agent. */
+static void put_column(double *to, int at, const double *from, int n)
+{
+    for (int j = 0; j < n; j++)
+        to[j * CONTROLLER_BLOCK + at] = from[j];
+}
+
+static void take_column(double *to, const double *from, int at, int n)
+{
+    for (int j = 0; j < n; j++)
+        to[j] = from[j * CONTROLLER_BLOCK + at];
+}
+
+/* The inputs of some agents with one controller, and what they remember next. */
+static void control(const Engine *e, const Point *p, const int64_t *agents, int n, double t)
+{
+    enum { B = CONTROLLER_BLOCK };
+    double all[MESSAGE * B], before[MEMORY * B], after[MEMORY * B], u[P * B], applied[P * B];
+    double disagreement[MESSAGE], silence[2];
+    for (int l = 0; l < n; l++) {
+        gather(e, p, agents[l], disagreement, silence);
+        put_column(all, l, disagreement, MESSAGE);
+        put_column(before, l, memory(e, p->k, agents[l]), MEMORY);
+    }
+    for (int l = n; l < B; l++) { /* what is left of the block repeats the last agent */
+        put_column(all, l, disagreement, MESSAGE);
+        put_column(before, l, memory(e, p->k, agents[n - 1]), MEMORY);
+    }
+    controller_block(controller(e, agents[0]), t, all, before, after, u, applied);
+    for (int l = 0; l < n; l++) {
+        const int64_t i = agents[l];
+        take_column(remembers(e, p, i), after, l, MEMORY);
+        take_column(e->u + i * P, u, l, P);
+        take_column(e->applied + i * P, applied, l, P);
+    }
+}
+
+#else
+
+enum { CONTROLLER_BLOCK = 1 };
+
+static void control(const Engine *e, const Point *p, const int64_t *agents, int n, double t)
+{
+    double disagreement[MESSAGE], silence[2];
+    for (int l = 0; l < n; l++) {
+        const int64_t i = agents[l];
+        gather(e, p, i, disagreement, silence);
+        controller_step(controller(e, i), own_values(e, i), t, measured(e, p->k, i), disagreement,
+                        silence, memory(e, p->k, i), remembers(e, p, i), e->u + i * P,
+                        e->applied + i * P);
+    }
+}
+
+#endif
+
+/* Let those of the agents first … end - 1 act whose step begins; the others only listen. */
+static void control_those(const Engine *e, const Point *p, int64_t first, int64_t end, double t)
+{
+    int64_t acting[CONTROLLER_BLOCK];
+    int n = 0;
+    for (int64_t i = first; i < end; i++) {
+        if (!begins(e, p->k, i)) {
+            if (e->held)
+                listen(e, p, i);
+            continue;
+        }
+        if (n && e->controller[i] != e->controller[acting[0]]) {
+            control(e, p, acting, n, t);
+            n = 0;
+        }
+        acting[n++] = i;
+    }
+    if (n)
+        control(e, p, acting, n, t);
+    for (int64_t i = first; i < end; i++)
+        if (begins(e, p->k, i))
+            actuate(e, p, i);
 }
 
 /* Put the inputs of an instance together: u of an agent, then what it is wired to. */
@@ -431,15 +514,15 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
     int steps = go;
     int64_t posted = 0;
     *signal = (Signal){0};
-    for (int64_t i = me->first; i < me->end; i++) {
-        if (begins(e, p->k, i))
-            control(e, p, i, t);
-        else if (e->held)
-            listen(e, p, i);
-        record(e, p, i);
-        note_lowest(e, p, i, t);
-        if (steps)
-            steps = step(e, me, p, i, &posted, signal);
+    for (int64_t first = me->first; first < me->end; first += CONTROLLER_BLOCK) {
+        const int64_t end = first + CONTROLLER_BLOCK < me->end ? first + CONTROLLER_BLOCK : me->end;
+        control_those(e, p, first, end, t);
+        for (int64_t i = first; i < end; i++) {
+            record(e, p, i);
+            note_lowest(e, p, i, t);
+            if (steps)
+                steps = step(e, me, p, i, &posted, signal);
+        }
     }
     for (int64_t i = me->first_other; i < me->end_other && steps; i++)
         steps = step(e, me, p, i, &posted, signal);

@@ -1,0 +1,218 @@
+/* Several agents at once: a `Lanes` holds one number of each of LANES agents.
+ *
+ * It is a vector of the compiler (GCC, clang), or one double where LANES is 1: the same source gives
+ * a controller for many agents and one for a single agent. Only + - * / and operations on bits are
+ * used, so that a lane is computed alike wherever it stands and whatever the processor (compile with
+ * -ffp-contract=off): results do not depend on how agents are grouped.
+ *
+ * sin, cos, exp and tanh: reduction after Cody and Waite (Software Manual for the Elementary
+ * Functions, 1980) with polynomials fitted at Chebyshev nodes, at most 2 units in the last place
+ * (tanh: 4). An argument beyond the range of the reduction, and every other function, goes lane by
+ * lane to math.h. */
+#ifndef LANES_H
+#define LANES_H
+
+#include <math.h>
+#include <stdint.h>
+
+#if LANES > 1
+typedef double Lanes __attribute__((vector_size(LANES * 8)));
+typedef int64_t Bits __attribute__((vector_size(LANES * 8)));
+#define LANES_WHERE(condition) (condition) /* all bits of a lane where it holds, else none */
+#else
+typedef double Lanes;
+typedef int64_t Bits;
+#define LANES_WHERE(condition) (-(int64_t)(condition))
+#endif
+
+#define LANES_INLINE static inline __attribute__((always_inline, unused))
+
+typedef union {
+    Lanes value;
+    Bits bits;
+    double lane[LANES];
+    int64_t lane_bits[LANES];
+} LanesView;
+
+/* The same number in all lanes. */
+LANES_INLINE Lanes lanes_of(double value)
+{
+    return value - (Lanes){0};
+}
+
+LANES_INLINE Bits lanes_bits(Lanes x)
+{
+    return (LanesView){.value = x}.bits;
+}
+
+LANES_INLINE Lanes lanes_from(Bits bits)
+{
+    return (LanesView){.bits = bits}.value;
+}
+
+/* yes where the mask has all bits, else no */
+LANES_INLINE Lanes lanes_select(Bits mask, Lanes yes, Lanes no)
+{
+    return lanes_from((mask & lanes_bits(yes)) | (~mask & lanes_bits(no)));
+}
+
+LANES_INLINE Lanes lanes_abs(Lanes x)
+{
+    return lanes_from(lanes_bits(x) & INT64_MAX);
+}
+
+/* NaN where either is. */
+LANES_INLINE Lanes lanes_min(Lanes a, Lanes b)
+{
+    return lanes_select(LANES_WHERE(a < b) | LANES_WHERE(a != a), a, b);
+}
+
+LANES_INLINE Lanes lanes_max(Lanes a, Lanes b)
+{
+    return lanes_select(LANES_WHERE(a > b) | LANES_WHERE(a != a), a, b);
+}
+
+LANES_INLINE Lanes lanes_sign(Lanes x)
+{
+    const Lanes zero = {0}, one = lanes_of(1);
+    return lanes_select(LANES_WHERE(x > zero), one, zero) -
+           lanes_select(LANES_WHERE(x < zero), one, zero);
+}
+
+/* A function of math.h, lane by lane. */
+LANES_INLINE Lanes lanes_each(double (*f)(double), Lanes x)
+{
+    LanesView to = {.value = x};
+    for (int l = 0; l < LANES; l++)
+        to.lane[l] = f(to.lane[l]);
+    return to.value;
+}
+
+LANES_INLINE Lanes lanes_pow(Lanes x, Lanes y)
+{
+    LanesView to = {.value = x}, exponent = {.value = y};
+    for (int l = 0; l < LANES; l++)
+        to.lane[l] = pow(to.lane[l], exponent.lane[l]);
+    return to.value;
+}
+
+LANES_INLINE Lanes lanes_sqrt(Lanes x)
+{
+    LanesView to = {.value = x};
+    for (int l = 0; l < LANES; l++)
+        to.lane[l] = sqrt(to.lane[l]); /* correctly rounded everywhere */
+    return to.value;
+}
+
+/* Whether all lanes are below the limit in modulus; NaN is not. */
+LANES_INLINE int lanes_all_below(Lanes x, double limit)
+{
+    const LanesView over = {.bits = ~LANES_WHERE(lanes_abs(x) < lanes_of(limit))};
+    int64_t any = 0;
+    for (int l = 0; l < LANES; l++)
+        any |= over.lane_bits[l];
+    return !any;
+}
+
+/* Replace the lanes that are not below the limit by what math.h says. */
+static __attribute__((noinline, unused)) void lanes_replace(double (*f)(double), const Lanes *x,
+                                                            double limit, Lanes *y)
+{
+    const double *from = (const double *)x;
+    double *to = (double *)y;
+    for (int l = 0; l < LANES; l++)
+        if (!(fabs(from[l]) < limit))
+            to[l] = f(from[l]);
+}
+
+#define LANES_TO_INTEGER 6755399441055744.0 /* 1.5 * 2^52: adding it rounds to an integer */
+
+/* c[0] + c[1] z + … + c[5] z^5, in pairs: what waits for nothing is computed side by side */
+LANES_INLINE Lanes lanes_polynomial(const double *c, Lanes z)
+{
+    const Lanes zz = z * z, a = c[0] + c[1] * z, b = c[2] + c[3] * z, d = c[4] + c[5] * z;
+    return a + zz * (b + zz * d);
+}
+
+/* sin(x + quarters pi / 2) for |x| < 1e6 */
+LANES_INLINE Lanes lanes_circular(Lanes x, int64_t quarters)
+{
+    static const double S[] = {-0.16666666666666666, 0.008333333333330946, -0.00019841269836753985,
+                               2.755731610017207e-06, -2.505113134896025e-08,
+                               1.5918093561437567e-10};
+    static const double C[] = {0.041666666666666664, -0.0013888888888887395,
+                               2.4801587298762816e-05, -2.755731727024068e-07,
+                               2.0876145958084937e-09, -1.1382610070998183e-11};
+    /* pi / 2 in three parts, the first two of 33 bits: their products with n are exact */
+    const double P1 = 1.5707963267341256, P2 = 6.077100506303966e-11, P3 = 2.0222662487959506e-21;
+    const Lanes shifted = x * 0.6366197723675814 + LANES_TO_INTEGER;
+    const Bits quadrant = lanes_bits(shifted) + quarters;
+    const Lanes n = shifted - LANES_TO_INTEGER;
+    const Lanes t = x - n * P1, w = n * P2, r = t - w, rest = n * P3 - ((t - r) - w);
+    const Lanes y = r - rest, tail = (r - y) - rest; /* the reduced argument is y + tail */
+    const Lanes z = y * y, half = 0.5 * z, one_less = 1.0 - half;
+    const Lanes sine = y + (y * (z * lanes_polynomial(S, z)) + tail * one_less);
+    const Lanes cosine =
+        one_less + (((1.0 - one_less) - half) + (z * z * lanes_polynomial(C, z) - y * tail));
+    const Lanes chosen = lanes_select(-(quadrant & 1), cosine, sine);
+    return lanes_from(lanes_bits(chosen) ^ ((quadrant & 2) << 62));
+}
+
+#define LANES_TURNS 1e6 /* sin and cos are reduced below it */
+
+LANES_INLINE Lanes lanes_sin(Lanes x)
+{
+    Lanes y = lanes_circular(x, 0);
+    if (!lanes_all_below(x, LANES_TURNS))
+        lanes_replace(sin, &x, LANES_TURNS, &y);
+    return lanes_select(LANES_WHERE(x == (Lanes){0}), x, y); /* the sign of zero */
+}
+
+LANES_INLINE Lanes lanes_cos(Lanes x)
+{
+    Lanes y = lanes_circular(x, 1);
+    if (!lanes_all_below(x, LANES_TURNS))
+        lanes_replace(cos, &x, LANES_TURNS, &y);
+    return y;
+}
+
+/* x = n ln 2 + r; power: 2^n; returns e^r - 1, for |x| < 700 */
+LANES_INLINE Lanes lanes_expm1_reduced(Lanes x, Lanes *power)
+{
+    static const double E[] = {0.16666666666666669, 0.041666666666666664, 0.008333333333330065,
+                               0.0013888888888886554, 0.00019841269863040922,
+                               2.4801587317135435e-05, 2.7557268479724004e-06,
+                               2.7557282983637385e-07, 2.510037611136142e-08,
+                               2.0911229928855294e-09};
+    const double LOG2_HIGH = 0.6931471803691238, LOG2_LOW = 1.9082149292705877e-10;
+    const Lanes shifted = x * 1.4426950408889634 + LANES_TO_INTEGER;
+    const Lanes n = shifted - LANES_TO_INTEGER;
+    const Lanes high = x - n * LOG2_HIGH, low = n * LOG2_LOW, r = high - low;
+    const Lanes tail = (high - r) - low, z = r * r;
+    *power = lanes_from((lanes_bits(shifted) << 52) + lanes_bits(lanes_of(1)));
+    const Lanes higher = (E[6] + E[7] * r) + z * (E[8] + E[9] * r);
+    const Lanes cubic = lanes_polynomial(E, r) + z * z * z * higher;
+    return r + (0.5 * z + (z * r * cubic + (tail + tail * r)));
+}
+
+#define LANES_EXPONENT 700.0 /* e^x is normal, with room, below it */
+
+LANES_INLINE Lanes lanes_exp(Lanes x)
+{
+    Lanes power, less = lanes_expm1_reduced(x, &power), y = power + power * less;
+    if (!lanes_all_below(x, LANES_EXPONENT))
+        lanes_replace(exp, &x, LANES_EXPONENT, &y);
+    return y;
+}
+
+/* tanh x = e / (e + 2) with e = e^(2x) - 1; beyond 20 it is 1 to the last bit */
+LANES_INLINE Lanes lanes_tanh(Lanes x)
+{
+    const Bits sign = lanes_bits(x) & INT64_MIN;
+    const Lanes a = lanes_min(lanes_abs(x), lanes_of(20.0)), one = lanes_of(1);
+    Lanes power, less = lanes_expm1_reduced(2.0 * a, &power);
+    const Lanes e = power * less + (power - one);
+    return lanes_from(lanes_bits(e / (e + 2.0)) | sign);
+}
+
+#endif
