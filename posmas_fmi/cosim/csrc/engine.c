@@ -104,6 +104,7 @@ typedef struct {
     int64_t slot, next;      /* of k and k + 1 */
     int64_t row;             /* of this slice */
     const int32_t *arrivals; /* at k */
+    double t, h;             /* time [s], and the communication step */
 } Point;
 
 static int64_t slot_before(const Engine *e, const Point *p, int64_t age)
@@ -261,15 +262,21 @@ static void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
 
 /* ---- one instance ---------------------------------------------------------------------------- */
 
+/* k % every == 0; a division takes as long as all else here, and most periods are one step */
+static int is_multiple(int64_t k, int64_t every)
+{
+    return every == 1 || k % every == 0;
+}
+
 /* Whether a step of instance i begins at point k, and whether one ends at k + 1. */
 static int begins(const Engine *e, int64_t k, int64_t i)
 {
-    return !e->frozen[i] && k % e->every[i] == 0;
+    return !e->frozen[i] && is_multiple(k, e->every[i]);
 }
 
 static int ends(const Engine *e, int64_t k, int64_t i)
 {
-    return !e->frozen[i] && (k + 1) % e->every[i] == 0;
+    return !e->frozen[i] && is_multiple(k + 1, e->every[i]);
 }
 
 /* What agent i remembers at the next point goes here: at once, or when its period is over. */
@@ -437,7 +444,9 @@ static int step(const Engine *e, const Member *me, const Point *p, int64_t i, in
         carry(e, p, i);
         return 1;
     }
-    const double t = time_of(e, p->k + 1 - e->every[i]), h = step_of(e, i);
+    const int64_t every = e->every[i];
+    const double t = every == 1 ? p->t : time_of(e, p->k + 1 - every);
+    const double h = every == 1 ? p->h : step_of(e, i);
     const double *inputs = e->inputs + f->input_at[i];
     if (fmus_is_remote(f, i)) {
         f->remote->post(f->remote->context, i, t, h, inputs);
@@ -510,7 +519,7 @@ static void wait_for_posted(const Engine *e, const Member *me, const Point *p, i
 /* Control and record at a point; if `go`, step to the next one and read there. */
 static void advance(const Engine *e, const Member *me, const Point *p, int go, Signal *signal)
 {
-    const double t = time_of(e, p->k);
+    const double t = p->t;
     int steps = go;
     int64_t posted = 0;
     *signal = (Signal){0};
@@ -568,7 +577,8 @@ static void run(Member *me)
 {
     Team *team = me->team;
     const Engine *e = team->e;
-    Point p = {e->k, e->k % e->slots, (e->k + 1) % e->slots, 0, e->arrivals};
+    Point p = {e->k, e->k % e->slots, (e->k + 1) % e->slots, 0, e->arrivals, time_of(e, e->k),
+               (double)e->period / 1e9};
     Signal all = {0};
     if (e->ready == 0) {
         read_first(e, me, &p, &team->signals[p.k & 1][me->id]);
@@ -593,7 +603,7 @@ static void run(Member *me)
             return;
         }
         me->diverging = all.diverging;
-        p.k++;
+        p.t = time_of(e, ++p.k);
         p.row++;
         p.slot = p.next;
         p.next = p.next + 1 < e->slots ? p.next + 1 : 0;

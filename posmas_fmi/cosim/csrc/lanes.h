@@ -14,6 +14,9 @@
 
 #include <math.h>
 #include <stdint.h>
+#if defined __SSE2__
+#include <immintrin.h>
+#endif
 
 #if LANES > 1
 typedef double Lanes __attribute__((vector_size(LANES * 8)));
@@ -104,14 +107,28 @@ LANES_INLINE Lanes lanes_sqrt(Lanes x)
     return to.value;
 }
 
+/* Whether a mask is empty. */
+LANES_INLINE int lanes_none(Bits mask)
+{
+    const LanesView view = {.bits = mask};
+#if defined __AVX512DQ__ && LANES == 8
+    return !_mm512_movepi64_mask((__m512i)view.bits);
+#elif defined __AVX__ && LANES == 4
+    return !_mm256_movemask_pd((__m256d)view.value);
+#elif defined __SSE2__ && LANES == 2
+    return !_mm_movemask_pd((__m128d)view.value);
+#else
+    int64_t any = 0;
+    for (int l = 0; l < LANES; l++)
+        any |= view.lane_bits[l];
+    return !any;
+#endif
+}
+
 /* Whether all lanes are below the limit in modulus; NaN is not. */
 LANES_INLINE int lanes_all_below(Lanes x, double limit)
 {
-    const LanesView over = {.bits = ~LANES_WHERE(lanes_abs(x) < lanes_of(limit))};
-    int64_t any = 0;
-    for (int l = 0; l < LANES; l++)
-        any |= over.lane_bits[l];
-    return !any;
+    return lanes_none(~LANES_WHERE(lanes_abs(x) < lanes_of(limit)));
 }
 
 /* Replace the lanes that are not below the limit by what math.h says. */
@@ -165,7 +182,7 @@ LANES_INLINE Lanes lanes_sin(Lanes x)
     Lanes y = lanes_circular(x, 0);
     if (!lanes_all_below(x, LANES_TURNS))
         lanes_replace(sin, &x, LANES_TURNS, &y);
-    return lanes_select(LANES_WHERE(x == (Lanes){0}), x, y); /* the sign of zero */
+    return y; /* sin(-0) is +0 */
 }
 
 LANES_INLINE Lanes lanes_cos(Lanes x)
