@@ -13,6 +13,10 @@
 
 enum { MAX_THREADS = 64 };
 
+/* `plain` says that nothing but the ordinary happens in a slice (see `is_plain`). It is a constant
+ * where it is given, so there are two copies of what is done for an agent: one without the tests. */
+#define FOR_EACH_AGENT static inline __attribute__((always_inline))
+
 /* What a thread tells the others at a communication point. */
 typedef struct {
     int failed;
@@ -23,6 +27,7 @@ typedef struct {
 
 typedef struct {
     Engine *e;
+    int plain;
     Barrier barrier;
     int64_t gate;                    /* 1: go; 2: there are not enough threads */
     Signal signals[3][MAX_THREADS];  /* two in turn: a thread can be one point ahead of another;
@@ -113,9 +118,13 @@ static int64_t slot_before(const Engine *e, const Point *p, int64_t age)
 }
 
 /* What is held at the end of an arc, and its age in steps; a message that arrives now is taken. */
-static const double *hear(const Engine *e, const Point *p, int64_t arc, int64_t sender,
-                          int64_t *age)
+FOR_EACH_AGENT const double *hear(const Engine *e, const Point *p, int64_t arc, int64_t sender,
+                                  int64_t *age, const int plain)
 {
+    if (plain) {
+        *age = 0;
+        return message(e, p->slot, sender);
+    }
     if (!e->held) {
         *age = e->delay ? e->delay[arc] : 0;
         if (*age > p->k)
@@ -133,14 +142,14 @@ static const double *hear(const Engine *e, const Point *p, int64_t arc, int64_t 
 
 /* Gather what agent i has heard: the disagreement (MESSAGE) of (6) and, for what belongs to it, of
  * the observer (22); and how long ago it was sent, by the neighbours and by the leader. */
-static void gather(const Engine *e, const Point *p, int64_t i, double *disagreement,
-                   double *silence)
+FOR_EACH_AGENT void gather(const Engine *e, const Point *p, int64_t i, double *disagreement,
+                           double *silence, const int plain)
 {
     enum { FIRST = MESSAGE - INNOVATION };
     double heard[MESSAGE] = {0};
     int64_t oldest = 0, from_leader = 0, age;
     for (int64_t arc = e->first_arc[i]; arc < e->first_arc[i + 1]; arc++) {
-        const double *from = hear(e, p, arc, e->sender[arc], &age);
+        const double *from = hear(e, p, arc, e->sender[arc], &age, plain);
         for (int j = 0; j < FIRST; j++)
             heard[j] += e->weight[arc] * from[j];
         if (e->innovation_weight)
@@ -155,7 +164,7 @@ static void gather(const Engine *e, const Point *p, int64_t i, double *disagreem
     for (int j = FIRST; j < MESSAGE; j++)
         disagreement[j] = e->own_innovation[i] * mine[j] - heard[j];
     if (e->leader_arc[i] >= 0) {
-        const double *s = hear(e, p, e->leader_arc[i], e->agents, &from_leader);
+        const double *s = hear(e, p, e->leader_arc[i], e->agents, &from_leader, plain);
         for (int j = 0; j < FIRST; j++)
             disagreement[j] -= e->leader[i] * s[j];
     }
@@ -168,9 +177,9 @@ static void listen(const Engine *e, const Point *p, int64_t i)
 {
     int64_t age;
     for (int64_t arc = e->first_arc[i]; arc < e->first_arc[i + 1]; arc++)
-        hear(e, p, arc, e->sender[arc], &age);
+        hear(e, p, arc, e->sender[arc], &age, 0);
     if (e->leader_arc[i] >= 0)
-        hear(e, p, e->leader_arc[i], e->agents, &age);
+        hear(e, p, e->leader_arc[i], e->agents, &age, 0);
 }
 
 /* ---- measuring ------------------------------------------------------------------------------- */
@@ -184,12 +193,14 @@ static double source(const Engine *e, int64_t k, int64_t row, int64_t term)
 }
 
 /* What agent i measures at point k; a sensor that is stuck shows what it showed before. */
-static void measure(const Engine *e, int64_t k, int64_t row, int64_t i)
+FOR_EACH_AGENT void measure(const Engine *e, int64_t k, int64_t row, int64_t i, const int plain)
 {
     double *to = measured(e, k, i);
     const double *y = reading(e, k, i), *before = measured(e, k - 1, i);
     for (int j = 0; j < MEASURED; j++)
         to[j] = j < Q ? y[j] : source(e, k, row, e->measured_from[i * (MEASURED - Q) + j - Q]);
+    if (plain)
+        return;
     if (e->noise)
         for (int j = 0; j < MEASURED; j++)
             to[j] += e->noise[(row * e->agents + i) * MEASURED + j];
@@ -204,18 +215,19 @@ static void measure(const Engine *e, int64_t k, int64_t row, int64_t i)
 }
 
 /* Measure at point k and put what is sent there into its slot. */
-static void send(const Engine *e, int64_t k, int64_t slot, int64_t row, int64_t i)
+FOR_EACH_AGENT void send(const Engine *e, int64_t k, int64_t slot, int64_t row, int64_t i,
+                         const int plain)
 {
     double *to = message(e, slot, i);
-    measure(e, k, row, i);
+    measure(e, k, row, i, plain);
     controller_send(controller(e, i), own_values(e, i), memory(e, k, i), measured(e, k, i), to);
-    if (e->resolution > 0)
+    if (!plain && e->resolution > 0)
         for (int j = 0; j < MESSAGE; j++)
             to[j] = rounded(to[j], e->resolution);
 }
 
 /* Whether state and estimate of agent i are finite and within the limit. */
-static int within(const Engine *e, int64_t k, int64_t i)
+FOR_EACH_AGENT int within(const Engine *e, int64_t k, int64_t i)
 {
     const double *xhat = memory(e, k, i), *x = reading(e, k, i) + Q;
     int good = 1;
@@ -229,7 +241,7 @@ static int within(const Engine *e, int64_t k, int64_t i)
 
 /* ---- recording ------------------------------------------------------------------------------- */
 
-static void record(const Engine *e, const Point *p, int64_t i)
+FOR_EACH_AGENT void record(const Engine *e, const Point *p, int64_t i)
 {
     const int64_t at = p->row * e->agents + i;
     const double *values = reading(e, p->k, i);
@@ -247,7 +259,7 @@ static void record(const Engine *e, const Point *p, int64_t i)
         copy(e->measured_rows + at * MEASURED, measured(e, p->k, i), MEASURED);
 }
 
-static void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
+FOR_EACH_AGENT void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
 {
     const double *x = e->shows_states ? reading(e, p->k, i) + Q : memory(e, p->k, i);
     double lowest = x[0];
@@ -269,29 +281,29 @@ static int is_multiple(int64_t k, int64_t every)
 }
 
 /* Whether a step of instance i begins at point k, and whether one ends at k + 1. */
-static int begins(const Engine *e, int64_t k, int64_t i)
+FOR_EACH_AGENT int begins(const Engine *e, int64_t k, int64_t i, const int plain)
 {
-    return !e->frozen[i] && is_multiple(k, e->every[i]);
+    return plain || (!e->frozen[i] && is_multiple(k, e->every[i]));
 }
 
-static int ends(const Engine *e, int64_t k, int64_t i)
+FOR_EACH_AGENT int ends(const Engine *e, int64_t k, int64_t i, const int plain)
 {
-    return !e->frozen[i] && is_multiple(k + 1, e->every[i]);
+    return plain || (!e->frozen[i] && is_multiple(k + 1, e->every[i]));
 }
 
 /* What agent i remembers at the next point goes here: at once, or when its period is over. */
-static double *remembers(const Engine *e, const Point *p, int64_t i)
+FOR_EACH_AGENT double *remembers(const Engine *e, const Point *p, int64_t i, const int plain)
 {
-    return e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
+    return plain || e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
 }
 
 /* What the actuator of agent i makes of its input. */
-static void actuate(const Engine *e, const Point *p, int64_t i)
+FOR_EACH_AGENT void actuate(const Engine *e, const Point *p, int64_t i, const int plain)
 {
     const double *u = e->u + i * P;
     double *actuated = e->actuated + i * P;
     for (int j = 0; j < P; j++) {
-        const double gain = e->actuator_gain && p->k > 0 ? e->actuator_gain[i * P + j] : 1;
+        const double gain = !plain && e->actuator_gain && p->k > 0 ? e->actuator_gain[i * P + j] : 1;
         actuated[j] = gain == 1 ? u[j] : actuated[j] + gain * (u[j] - actuated[j]);
     }
 }
@@ -299,26 +311,27 @@ static void actuate(const Engine *e, const Point *p, int64_t i)
 #if defined CONTROLLER_BLOCK
 
 /* Column `at` of a matrix with CONTROLLER_BLOCK columns, from and to the values of one agent. */
-static void put_column(double *to, int at, const double *from, int n)
+FOR_EACH_AGENT void put_column(double *to, int at, const double *from, int n)
 {
     for (int j = 0; j < n; j++)
         to[j * CONTROLLER_BLOCK + at] = from[j];
 }
 
-static void take_column(double *to, const double *from, int at, int n)
+FOR_EACH_AGENT void take_column(double *to, const double *from, int at, int n)
 {
     for (int j = 0; j < n; j++)
         to[j] = from[j * CONTROLLER_BLOCK + at];
 }
 
 /* The inputs of some agents with one controller, and what they remember next. */
-static void control(const Engine *e, const Point *p, const int64_t *agents, int n, double t)
+FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agents, int n,
+                            const int plain)
 {
     enum { B = CONTROLLER_BLOCK };
     double all[MESSAGE * B], before[MEMORY * B], after[MEMORY * B], u[P * B], applied[P * B];
     double disagreement[MESSAGE], silence[2];
     for (int l = 0; l < n; l++) {
-        gather(e, p, agents[l], disagreement, silence);
+        gather(e, p, agents[l], disagreement, silence, plain);
         put_column(all, l, disagreement, MESSAGE);
         put_column(before, l, memory(e, p->k, agents[l]), MEMORY);
     }
@@ -326,10 +339,10 @@ static void control(const Engine *e, const Point *p, const int64_t *agents, int 
         put_column(all, l, disagreement, MESSAGE);
         put_column(before, l, memory(e, p->k, agents[n - 1]), MEMORY);
     }
-    controller_block(controller(e, agents[0]), t, all, before, after, u, applied);
+    controller_block(controller(e, agents[0]), p->t, all, before, after, u, applied);
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
-        take_column(remembers(e, p, i), after, l, MEMORY);
+        take_column(remembers(e, p, i, plain), after, l, MEMORY);
         take_column(e->u + i * P, u, l, P);
         take_column(e->applied + i * P, applied, l, P);
     }
@@ -339,14 +352,15 @@ static void control(const Engine *e, const Point *p, const int64_t *agents, int 
 
 enum { CONTROLLER_BLOCK = 1 };
 
-static void control(const Engine *e, const Point *p, const int64_t *agents, int n, double t)
+FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agents, int n,
+                            const int plain)
 {
     double disagreement[MESSAGE], silence[2];
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
-        gather(e, p, i, disagreement, silence);
-        controller_step(controller(e, i), own_values(e, i), t, measured(e, p->k, i), disagreement,
-                        silence, memory(e, p->k, i), remembers(e, p, i), e->u + i * P,
+        gather(e, p, i, disagreement, silence, plain);
+        controller_step(controller(e, i), own_values(e, i), p->t, measured(e, p->k, i), disagreement,
+                        silence, memory(e, p->k, i), remembers(e, p, i, plain), e->u + i * P,
                         e->applied + i * P);
     }
 }
@@ -354,37 +368,40 @@ static void control(const Engine *e, const Point *p, const int64_t *agents, int 
 #endif
 
 /* Let those of the agents first … end - 1 act whose step begins; the others only listen. */
-static void control_those(const Engine *e, const Point *p, int64_t first, int64_t end, double t)
+FOR_EACH_AGENT void control_those(const Engine *e, const Point *p, int64_t first, int64_t end,
+                                  const int plain)
 {
     int64_t acting[CONTROLLER_BLOCK];
     int n = 0;
     for (int64_t i = first; i < end; i++) {
-        if (!begins(e, p->k, i)) {
+        if (!begins(e, p->k, i, plain)) {
             if (e->held)
                 listen(e, p, i);
             continue;
         }
-        if (n && e->controller[i] != e->controller[acting[0]]) {
-            control(e, p, acting, n, t);
+        if (!plain && n && e->controller[i] != e->controller[acting[0]]) {
+            control(e, p, acting, n, plain);
             n = 0;
         }
         acting[n++] = i;
     }
     if (n)
-        control(e, p, acting, n, t);
+        control(e, p, acting, n, plain);
     for (int64_t i = first; i < end; i++)
-        if (begins(e, p->k, i))
-            actuate(e, p, i);
+        if (begins(e, p->k, i, plain))
+            actuate(e, p, i, plain);
 }
 
 /* Put the inputs of an instance together: u of an agent, then what it is wired to. */
-static void set_inputs(const Engine *e, const Point *p, int64_t i)
+FOR_EACH_AGENT void set_inputs(const Engine *e, const Point *p, int64_t i, const int plain)
 {
     double *to = e->inputs + e->fmus->input_at[i];
     if (i < e->agents) {
         copy(to, e->actuated + i * P, P);
         to += P;
     }
+    if (plain)
+        return;
     for (int64_t extra = e->first_extra[i]; extra < e->first_extra[i + 1]; extra++) {
         double value = e->extra_bias[extra];
         for (int64_t term = e->first_term[extra]; term < e->first_term[extra + 1]; term++)
@@ -420,35 +437,36 @@ static void failed(const Engine *e, const Point *p, int64_t i, Report *report, S
 }
 
 /* What follows when the readings of instance i at k + 1 are there. */
-static void arrived(const Engine *e, const Point *p, int64_t i, Signal *signal)
+FOR_EACH_AGENT void arrived(const Engine *e, const Point *p, int64_t i, Signal *signal,
+                            const int plain)
 {
     if (i >= e->agents)
         return;
-    if (e->every[i] != 1)
+    if (!plain && e->every[i] != 1)
         copy(memory(e, p->k + 1, i), e->pending + i * MEMORY, MEMORY);
-    if (!e->measures_others)
-        send(e, p->k + 1, p->next, p->row + 1, i);
+    if (plain || !e->measures_others)
+        send(e, p->k + 1, p->next, p->row + 1, i, plain);
     if (!within(e, p->k + 1, i))
         signal->diverging = 1;
 }
 
 /* Take instance i from k to k + 1; `posted` counts those that another process takes there. Returns
  * whether the instances after it are to be stepped. */
-static int step(const Engine *e, const Member *me, const Point *p, int64_t i, int64_t *posted,
-                Signal *signal)
+FOR_EACH_AGENT int step(const Engine *e, const Member *me, const Point *p, int64_t i,
+                        int64_t *posted, Signal *signal, const int plain)
 {
     const Fmus *f = e->fmus;
-    if (begins(e, p->k, i))
-        set_inputs(e, p, i);
-    if (!ends(e, p->k, i)) {
+    if (begins(e, p->k, i, plain))
+        set_inputs(e, p, i, plain);
+    if (!ends(e, p->k, i, plain)) {
         carry(e, p, i);
         return 1;
     }
-    const int64_t every = e->every[i];
+    const int64_t every = plain ? 1 : e->every[i];
     const double t = every == 1 ? p->t : time_of(e, p->k + 1 - every);
     const double h = every == 1 ? p->h : step_of(e, i);
     const double *inputs = e->inputs + f->input_at[i];
-    if (fmus_is_remote(f, i)) {
+    if (!plain && fmus_is_remote(f, i)) {
         f->remote->post(f->remote->context, i, t, h, inputs);
         ++*posted;
         return 1;
@@ -458,7 +476,7 @@ static int step(const Engine *e, const Member *me, const Point *p, int64_t i, in
         return !signal->failed; /* the rest of this point is recorded */
     }
     if (fmus_read(f, i, reading(e, p->k + 1, i), me->scratch, me->report))
-        arrived(e, p, i, signal);
+        arrived(e, p, i, signal, plain);
     else
         failed(e, p, i, me->report, signal);
     return 1;
@@ -482,8 +500,8 @@ static void send_first(const Engine *e, const Member *me, const Point *p, Signal
 {
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++) {
-        if (begins(e, p->k, i))
-            send(e, p->k, p->slot, 0, i);
+        if (begins(e, p->k, i, 0))
+            send(e, p->k, p->slot, 0, i, 0);
         if (!within(e, p->k, i))
             signal->diverging = 1;
     }
@@ -497,8 +515,8 @@ static void send_late(const Engine *e, const Member *me, const Point *p, Signal 
 {
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++)
-        if (ends(e, p->k, i))
-            send(e, p->k + 1, p->next, p->row + 1, i);
+        if (ends(e, p->k, i, 0))
+            send(e, p->k + 1, p->next, p->row + 1, i, 0);
 }
 
 /* Wait for what was posted by this thread. */
@@ -507,34 +525,67 @@ static void wait_for_posted(const Engine *e, const Member *me, const Point *p, i
 {
     const Remote *remote = e->fmus->remote;
     for (int64_t i = from; i < to; i++) {
-        if (!e->fmus->is_remote[i] || !ends(e, p->k, i))
+        if (!e->fmus->is_remote[i] || !ends(e, p->k, i, 0))
             continue;
         if (remote->wait(remote->context, i, reading(e, p->k + 1, i), me->report))
-            arrived(e, p, i, signal);
+            arrived(e, p, i, signal, 0);
         else
             failed(e, p, i, me->report, signal);
     }
 }
 
+/* Whether all agents are stepped at every point in this process, and nothing is between them and
+ * their FMUs and neighbours: no delay, no noise, no fault, no other wiring. */
+static int is_plain(const Engine *e)
+{
+    if (e->held || e->delay || e->noise || e->sensor_gain || e->actuator_gain ||
+        e->measures_others || e->resolution > 0 || e->fmus->remote)
+        return 0;
+    for (int64_t i = 0; i < e->agents; i++)
+        if (e->frozen[i] || e->every[i] != 1 || e->first_extra[i + 1] > e->first_extra[i])
+            return 0;
+    return 1;
+}
+
+/* The agents of one thread at a point; returns whether the instances after them are to be stepped. */
+FOR_EACH_AGENT int advance_agents(const Engine *e, const Member *me, const Point *p, int steps,
+                                  int64_t *posted, Signal *signal, const int plain)
+{
+    for (int64_t first = me->first; first < me->end; first += CONTROLLER_BLOCK) {
+        const int64_t end = first + CONTROLLER_BLOCK < me->end ? first + CONTROLLER_BLOCK : me->end;
+        control_those(e, p, first, end, plain);
+        for (int64_t i = first; i < end; i++) {
+            record(e, p, i);
+            note_lowest(e, p, i, p->t);
+            if (steps)
+                steps = step(e, me, p, i, posted, signal, plain);
+        }
+    }
+    return steps;
+}
+
+static int advance_plain_agents(const Engine *e, const Member *me, const Point *p, int steps,
+                                Signal *signal)
+{
+    int64_t none = 0;
+    return advance_agents(e, me, p, steps, &none, signal, 1);
+}
+
+static int advance_any_agents(const Engine *e, const Member *me, const Point *p, int steps,
+                              int64_t *posted, Signal *signal)
+{
+    return advance_agents(e, me, p, steps, posted, signal, 0);
+}
+
 /* Control and record at a point; if `go`, step to the next one and read there. */
 static void advance(const Engine *e, const Member *me, const Point *p, int go, Signal *signal)
 {
-    const double t = p->t;
-    int steps = go;
     int64_t posted = 0;
     *signal = (Signal){0};
-    for (int64_t first = me->first; first < me->end; first += CONTROLLER_BLOCK) {
-        const int64_t end = first + CONTROLLER_BLOCK < me->end ? first + CONTROLLER_BLOCK : me->end;
-        control_those(e, p, first, end, t);
-        for (int64_t i = first; i < end; i++) {
-            record(e, p, i);
-            note_lowest(e, p, i, t);
-            if (steps)
-                steps = step(e, me, p, i, &posted, signal);
-        }
-    }
+    int steps = me->team->plain ? advance_plain_agents(e, me, p, go, signal)
+                                : advance_any_agents(e, me, p, go, &posted, signal);
     for (int64_t i = me->first_other; i < me->end_other && steps; i++)
-        steps = step(e, me, p, i, &posted, signal);
+        steps = step(e, me, p, i, &posted, signal, 0);
     if (posted) {
         e->fmus->remote->send(e->fmus->remote->context);
         wait_for_posted(e, me, p, me->first, me->end, signal);
@@ -546,13 +597,13 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
     if (e->s_rows)
         copy(e->s_rows + p->row * M, leader, M);
     if (e->time)
-        e->time[p->row] = t;
+        e->time[p->row] = p->t;
     if (e->extra_rows)
         for (int64_t j = 0; j < e->extra_columns; j++)
             e->extra_rows[p->row * e->extra_columns + j] =
                 source(e, p->k, p->row, e->recorded[j]);
     if (go) {
-        controller_leader(e->controllers, t, leader, memory(e, p->k + 1, e->agents));
+        controller_leader(e->controllers, p->t, leader, memory(e, p->k + 1, e->agents));
         controller_leader_send(e->controllers, memory(e, p->k + 1, e->agents),
                                message(e, p->next, e->agents));
     }
@@ -639,7 +690,7 @@ static void merge(Report *reports, int64_t threads)
 /* Run from k up to the point `until` (not included); rows, ended and reports[0] say how it went. */
 EXPORT void engine_run(Engine *e)
 {
-    Team team = {.e = e};
+    Team team = {.e = e, .plain = is_plain(e)};
     Member members[MAX_THREADS];
     const int64_t n = e->agents, others = e->fmus->n - n;
     int64_t started = 1;
