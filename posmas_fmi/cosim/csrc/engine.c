@@ -339,7 +339,7 @@ FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agen
         put_column(all, l, disagreement, MESSAGE);
         put_column(before, l, memory(e, p->k, agents[n - 1]), MEMORY);
     }
-    controller_block(controller(e, agents[0]), p->t, all, before, after, u, applied);
+    controller_block(controller(e, agents[0]), n, p->t, all, before, after, u, applied);
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
         take_column(remembers(e, p, i, plain), after, l, MEMORY);

@@ -40,7 +40,10 @@ typedef union {
 /* The same number in all lanes. */
 LANES_INLINE Lanes lanes_of(double value)
 {
-    return value - (Lanes){0};
+    LanesView to;
+    for (int l = 0; l < LANES; l++)
+        to.lane[l] = value;
+    return to.value;
 }
 
 LANES_INLINE Bits lanes_bits(Lanes x)
@@ -166,11 +169,9 @@ LANES_INLINE Lanes lanes_circular(Lanes x, int64_t quarters)
     const Bits quadrant = lanes_bits(shifted) + quarters;
     const Lanes n = shifted - LANES_TO_INTEGER;
     const Lanes t = x - n * P1, w = n * P2, r = t - w, rest = n * P3 - ((t - r) - w);
-    const Lanes y = r - rest, tail = (r - y) - rest; /* the reduced argument is y + tail */
-    const Lanes z = y * y, half = 0.5 * z, one_less = 1.0 - half;
-    const Lanes sine = y + (y * (z * lanes_polynomial(S, z)) + tail * one_less);
-    const Lanes cosine =
-        one_less + (((1.0 - one_less) - half) + (z * z * lanes_polynomial(C, z) - y * tail));
+    const Lanes y = r - rest, z = y * y;
+    const Lanes sine = y + y * (z * lanes_polynomial(S, z));
+    const Lanes cosine = (1.0 - 0.5 * z) + z * z * lanes_polynomial(C, z);
     const Lanes chosen = lanes_select(-(quadrant & 1), cosine, sine);
     return lanes_from(lanes_bits(chosen) ^ ((quadrant & 2) << 62));
 }

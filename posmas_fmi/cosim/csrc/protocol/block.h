@@ -1,33 +1,39 @@
-/* controller_block in pieces of LANES agents; BLOCK_FUNCTION is its name. */
+/* controller_block in pieces of GROUPS * LANES agents; BLOCK_FUNCTION is its name. */
 #include <string.h>
 
 #include "step.h"
 
-static inline void load(Lanes *to, const double *from, int rows)
+/* Columns first … first + LANES - 1 of a matrix with CONTROLLER_BLOCK columns. */
+LANES_INLINE void load(Lanes *to, const double *from, int first, int rows)
 {
     for (int i = 0; i < rows; i++)
-        memcpy(&to[i], from + i * CONTROLLER_BLOCK, sizeof(Lanes));
+        memcpy(&to[i], from + i * CONTROLLER_BLOCK + first, sizeof(Lanes));
 }
 
-static inline void store(double *to, const Lanes *from, int rows)
+LANES_INLINE void store(double *to, const Lanes *from, int first, int rows)
 {
     for (int i = 0; i < rows; i++)
-        memcpy(to + i * CONTROLLER_BLOCK, &from[i], sizeof(Lanes));
+        memcpy(to + i * CONTROLLER_BLOCK + first, &from[i], sizeof(Lanes));
 }
 
-void BLOCK_FUNCTION(const Controller *c, double t, const double *disagreement,
+void BLOCK_FUNCTION(const Controller *c, int agents, double t, const double *disagreement,
                     const double *memory, double *next, double *u, double *applied);
 
-void BLOCK_FUNCTION(const Controller *c, double t, const double *disagreement,
+void BLOCK_FUNCTION(const Controller *c, int agents, double t, const double *disagreement,
                     const double *memory, double *next, double *u, double *applied)
 {
-    for (int first = 0; first < CONTROLLER_BLOCK; first += LANES) {
-        Lanes all[MESSAGE], before[MEMORY], after[MEMORY], input[P], taken[P];
-        load(all, disagreement + first, MESSAGE);
-        load(before, memory + first, MEMORY);
-        step(c, t, all, before, after, input, taken);
-        store(next + first, after, MEMORY);
-        store(u + first, input, P);
-        store(applied + first, taken, P);
+    for (int first = 0; first < agents; first += GROUPS * LANES) {
+        Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
+        Lanes input[GROUPS][P], taken[GROUPS][P];
+        for (int k = 0; k < GROUPS; k++) {
+            load(all[k], disagreement, first + k * LANES, MESSAGE);
+            load(before[k], memory, first + k * LANES, M);
+        }
+        step(c, t, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after, input, taken);
+        for (int k = 0; k < GROUPS; k++) {
+            store(next, after[k], first + k * LANES, M);
+            store(u, input[k], first + k * LANES, P);
+            store(applied, taken[k], first + k * LANES, P);
+        }
     }
 }

@@ -7,6 +7,7 @@
 #endif
 
 #define LANES 4
+#define GROUPS 2
 #define BLOCK_FUNCTION controller_block_4
 #include "block.h"
 

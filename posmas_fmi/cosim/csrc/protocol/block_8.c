@@ -7,6 +7,7 @@
 #endif
 
 #define LANES 8
+#define GROUPS 2
 #define BLOCK_FUNCTION controller_block_8
 #include "block.h"
 

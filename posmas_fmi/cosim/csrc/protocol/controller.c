@@ -1,5 +1,6 @@
 /* See controller.h. */
 #define LANES 1
+#define GROUPS 1
 #include "step.h"
 
 void controller_send(const Controller *c, const double *own, const double *memory,
@@ -21,13 +22,14 @@ void controller_step(const Controller *c, const double *own, double t, const dou
                      double *next, double *u, double *applied)
 {
     (void)own, (void)measured, (void)silence;
-    step(c, t, disagreement, memory, next, u, applied);
+    step(c, t, (const Lanes(*)[MESSAGE])disagreement, (const Lanes(*)[M])memory, (Lanes(*)[M])next,
+         (Lanes(*)[P])u, (Lanes(*)[P])applied);
 }
 
 void controller_leader(const Controller *c, double t, const double *memory, double *next)
 {
-    const double none[M] = {0};
-    propagate(c, t, memory, none, next);
+    const Lanes none[1][M] = {{0}};
+    propagate(c, t, (const Lanes(*)[M])memory, none, (Lanes(*)[M])next);
 }
 
 void controller_leader_send(const Controller *c, const double *memory, double *message)

@@ -53,10 +53,11 @@ void controller_step(const Controller *c, const double *own, double t, const dou
                      const double *disagreement, const double *silence, const double *memory,
                      double *next, double *u, double *applied);
 
-/* The same for CONTROLLER_BLOCK agents at once, to the same bits: columns are agents, so disagreement
- * is (MESSAGE, CONTROLLER_BLOCK). A controller without this function is called for one at a time. */
-#define CONTROLLER_BLOCK 8
-void controller_block(const Controller *c, double t, const double *disagreement,
+/* The same for many agents at once, to the same bits: columns are agents, so disagreement is
+ * (MESSAGE, CONTROLLER_BLOCK). All columns are to hold numbers, those of the first `agents` count.
+ * A controller without this function is called for one agent at a time. */
+#define CONTROLLER_BLOCK 16
+void controller_block(const Controller *c, int agents, double t, const double *disagreement,
                       const double *memory, double *next, double *u, double *applied);
 
 /* The leader: its memory (MEMORY) at t + h, and what it sends (MESSAGE). */

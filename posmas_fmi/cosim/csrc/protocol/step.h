@@ -1,4 +1,5 @@
-/* The step of the protocol for the agents of all lanes at once; LANES is set by who includes this.
+/* The step of the protocol for many agents at once: GROUPS vectors of LANES, which are set by who
+ * includes this.
  *
  * The observer's step is ETDRK4 (Cox and Matthews, J. Comput. Phys. 176, 2002): exact in A and in the
  * held input, fourth order in g. */
@@ -18,9 +19,11 @@ LANES_INLINE void add_product(Lanes *to, const double *W, const Lanes *from, int
 
 LANES_INLINE void set_product(Lanes *to, const double *W, const Lanes *from, int rows, int columns)
 {
-    for (int i = 0; i < rows; i++)
-        to[i] = lanes_of(0);
-    add_product(to, W, from, rows, columns);
+    for (int i = 0; i < rows; i++) {
+        to[i] = W[i * columns] * from[0];
+        for (int j = 1; j < columns; j++)
+            to[i] += W[i * columns + j] * from[j];
+    }
 }
 
 LANES_INLINE void copy(Lanes *to, const Lanes *from)
@@ -37,45 +40,60 @@ LANES_INLINE void weighted_g(const Controller *c, double t, const Lanes *x, Lane
     set_product(slope, c->H, g, M, M);
 }
 
-/* One step of x' = A x + H g(t, x) + w with w held. */
-LANES_INLINE void propagate(const Controller *c, double t, const Lanes *x, const Lanes *w,
-                            Lanes *next)
+/* One step of x' = A x + H g(t, x) + w with w held, for GROUPS vectors in turn: a stage waits for
+ * the one before it, and meanwhile the processor can compute that of another group. */
+LANES_INLINE void propagate(const Controller *c, double t, const Lanes x[][M], const Lanes w[][M],
+                            Lanes next[][M])
 {
-    Lanes ga[M], gb[M], gc[M], gd[M], base[M], a[M], stage[M], sum[M];
+    Lanes ga[GROUPS][M], gb[GROUPS][M], gc[GROUPS][M], gd[GROUPS][M];
+    Lanes base[GROUPS][M], a[GROUPS][M], stage[GROUPS][M];
     const double middle = t + 0.5 * c->h;
-    weighted_g(c, t, x, ga);
-    set_product(base, c->half, x, M, M);
-    add_product(base, c->half_gamma, w, M, M);
-    copy(a, base);
-    add_product(a, c->half_gamma, ga, M, M);
-    weighted_g(c, middle, a, gb);
-    copy(stage, base);
-    add_product(stage, c->half_gamma, gb, M, M);
-    weighted_g(c, middle, stage, gc);
-    for (int i = 0; i < M; i++)
-        sum[i] = 2.0 * gc[i] - ga[i] + w[i];
-    set_product(stage, c->half, a, M, M);
-    add_product(stage, c->half_gamma, sum, M, M);
-    weighted_g(c, t + c->h, stage, gd);
-    for (int i = 0; i < M; i++)
-        sum[i] = gb[i] + gc[i];
-    set_product(stage, c->full, x, M, M);
-    add_product(stage, c->gamma, w, M, M);
-    add_product(stage, c->start, ga, M, M);
-    add_product(stage, c->middle, sum, M, M);
-    add_product(stage, c->end, gd, M, M);
-    copy(next, stage);
+    for (int k = 0; k < GROUPS; k++)
+        weighted_g(c, t, x[k], ga[k]);
+    for (int k = 0; k < GROUPS; k++) {
+        set_product(base[k], c->half, x[k], M, M);
+        add_product(base[k], c->half_gamma, w[k], M, M);
+        copy(a[k], base[k]);
+        add_product(a[k], c->half_gamma, ga[k], M, M);
+        weighted_g(c, middle, a[k], gb[k]);
+    }
+    for (int k = 0; k < GROUPS; k++) {
+        copy(stage[k], base[k]);
+        add_product(stage[k], c->half_gamma, gb[k], M, M);
+        weighted_g(c, middle, stage[k], gc[k]);
+    }
+    for (int k = 0; k < GROUPS; k++) {
+        Lanes sum[M];
+        for (int i = 0; i < M; i++)
+            sum[i] = 2.0 * gc[k][i] - ga[k][i] + w[k][i];
+        set_product(stage[k], c->half, a[k], M, M);
+        add_product(stage[k], c->half_gamma, sum, M, M);
+        weighted_g(c, t + c->h, stage[k], gd[k]);
+    }
+    for (int k = 0; k < GROUPS; k++) {
+        Lanes sum[M], end[M];
+        for (int i = 0; i < M; i++)
+            sum[i] = gb[k][i] + gc[k][i];
+        set_product(end, c->full, x[k], M, M);
+        add_product(end, c->gamma, w[k], M, M);
+        add_product(end, c->start, ga[k], M, M);
+        add_product(end, c->middle, sum, M, M);
+        add_product(end, c->end, gd[k], M, M);
+        copy(next[k], end);
+    }
 }
 
-/* As controller_step, for all lanes. */
-LANES_INLINE void step(const Controller *c, double t, const Lanes *disagreement,
-                       const Lanes *memory, Lanes *next, Lanes *u, Lanes *applied)
+/* As controller_step, for all lanes of GROUPS vectors. */
+LANES_INLINE void step(const Controller *c, double t, const Lanes disagreement[][MESSAGE],
+                       const Lanes memory[][M], Lanes next[][M], Lanes u[][P], Lanes applied[][P])
 {
-    Lanes held[M];
-    set_product(u, c->K, disagreement, P, M);
-    agent_sec(u, applied);
-    set_product(held, c->B, applied, M, P);
-    add_product(held, c->E, disagreement + M, M, Q);
+    Lanes held[GROUPS][M];
+    for (int k = 0; k < GROUPS; k++) {
+        set_product(u[k], c->K, disagreement[k], P, M);
+        agent_sec(u[k], applied[k]);
+        set_product(held[k], c->B, applied[k], M, P);
+        add_product(held[k], c->E, disagreement[k] + M, M, Q);
+    }
     propagate(c, t, memory, held, next);
 }
 
