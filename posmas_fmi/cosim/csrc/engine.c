@@ -49,25 +49,54 @@ typedef struct {
 
 /* ---- where things are ------------------------------------------------------------------------ */
 
-static double *reading(const Engine *e, int64_t k, int64_t i)
+/* A communication point, and where that is which belongs to it. */
+typedef struct {
+    int64_t k;
+    int64_t row;             /* of this slice */
+    double *readings;        /* of all instances */
+    double *memory, *message; /* of the agents and the leader */
+    double *measured;        /* of the agents, and what they measured before */
+    const double *measured_before;
+} Place;
+
+static Place place(const Engine *e, int64_t k, int64_t row)
 {
-    const Fmus *f = e->fmus;
-    return e->readings + (k & 1) * f->reading_at[f->n] + f->reading_at[i];
+    const int64_t half = k & 1, n = e->agents;
+    return (Place){k,
+                   row,
+                   e->readings + half * e->fmus->reading_at[e->fmus->n],
+                   e->memory + half * (n + 1) * MEMORY,
+                   e->message + k % e->slots * (n + 1) * MESSAGE,
+                   e->measured + half * n * MEASURED,
+                   e->measured + !half * n * MEASURED};
 }
 
-static double *memory(const Engine *e, int64_t k, int64_t i)
+/* What is done between a point and the next one. */
+typedef struct {
+    int64_t k, row;
+    double t, h;             /* time [s], and the communication step */
+    const int32_t *arrivals; /* at k */
+    Place here, next;
+} Point;
+
+static double *reading(const Engine *e, const Place *at, int64_t i)
 {
-    return e->memory + ((k & 1) * (e->agents + 1) + i) * MEMORY;
+    return at->readings + e->fmus->reading_at[i];
 }
 
-static double *measured(const Engine *e, int64_t k, int64_t i)
+static double *memory(const Place *at, int64_t i)
 {
-    return e->measured + ((k & 1) * e->agents + i) * MEASURED;
+    return at->memory + i * MEMORY;
 }
 
-static double *message(const Engine *e, int64_t slot, int64_t i)
+static double *measured(const Place *at, int64_t i)
 {
-    return e->message + (slot * (e->agents + 1) + i) * MESSAGE;
+    return at->measured + i * MEASURED;
+}
+
+static double *message(const Place *at, int64_t i)
+{
+    return at->message + i * MESSAGE;
 }
 
 static const double *own_values(const Engine *e, int64_t i)
@@ -104,17 +133,10 @@ static double rounded(double value, double resolution)
 
 /* ---- the channel ----------------------------------------------------------------------------- */
 
-typedef struct {
-    int64_t k;
-    int64_t slot, next;      /* of k and k + 1 */
-    int64_t row;             /* of this slice */
-    const int32_t *arrivals; /* at k */
-    double t, h;             /* time [s], and the communication step */
-} Point;
-
-static int64_t slot_before(const Engine *e, const Point *p, int64_t age)
+/* The messages of the point that is `age` steps before. */
+static const double *message_before(const Engine *e, const Point *p, int64_t age, int64_t sender)
 {
-    return p->slot >= age ? p->slot - age : p->slot - age + e->slots;
+    return e->message + ((p->k - age) % e->slots * (e->agents + 1) + sender) * MESSAGE;
 }
 
 /* What is held at the end of an arc, and its age in steps; a message that arrives now is taken. */
@@ -123,18 +145,18 @@ FOR_EACH_AGENT const double *hear(const Engine *e, const Point *p, int64_t arc, 
 {
     if (plain) {
         *age = 0;
-        return message(e, p->slot, sender);
+        return message(&p->here, sender);
     }
     if (!e->held) {
         *age = e->delay ? e->delay[arc] : 0;
         if (*age > p->k)
             *age = p->k; /* until the first message has come the initial one is held */
-        return message(e, slot_before(e, p, *age), sender);
+        return message_before(e, p, *age, sender);
     }
     double *held = e->held + arc * MESSAGE;
     if (p->arrivals[arc] >= 0) {
         e->sent_at[arc] = p->k - p->arrivals[arc];
-        copy(held, message(e, slot_before(e, p, p->arrivals[arc]), sender), MESSAGE);
+        copy(held, message_before(e, p, p->arrivals[arc], sender), MESSAGE);
     }
     *age = p->k - e->sent_at[arc];
     return held;
@@ -158,7 +180,7 @@ FOR_EACH_AGENT void gather(const Engine *e, const Point *p, int64_t i, double *d
         if (age > oldest)
             oldest = age;
     }
-    const double *mine = message(e, p->slot, i);
+    const double *mine = message(&p->here, i);
     for (int j = 0; j < FIRST; j++)
         disagreement[j] = e->own[i] * mine[j] - heard[j];
     for (int j = FIRST; j < MESSAGE; j++)
@@ -184,52 +206,51 @@ static void listen(const Engine *e, const Point *p, int64_t i)
 
 /* ---- measuring ------------------------------------------------------------------------------- */
 
-/* A reading at point k, or an exogenous signal there; `row` is that of the signals. */
-static double source(const Engine *e, int64_t k, int64_t row, int64_t term)
+/* A reading at a point, or an exogenous signal there. */
+static double source(const Engine *e, const Place *at, int64_t term)
 {
     if (term < 0)
-        return e->drive[row * e->drives - 1 - term];
-    return e->readings[(k & 1) * e->fmus->reading_at[e->fmus->n] + term];
+        return e->drive[at->row * e->drives - 1 - term];
+    return at->readings[term];
 }
 
-/* What agent i measures at point k; a sensor that is stuck shows what it showed before. */
-FOR_EACH_AGENT void measure(const Engine *e, int64_t k, int64_t row, int64_t i, const int plain)
+/* What agent i measures at a point; a sensor that is stuck shows what it showed before. */
+FOR_EACH_AGENT void measure(const Engine *e, const Place *at, int64_t i, const int plain)
 {
-    double *to = measured(e, k, i);
-    const double *y = reading(e, k, i), *before = measured(e, k - 1, i);
+    double *to = measured(at, i);
+    const double *y = reading(e, at, i), *before = at->measured_before + i * MEASURED;
     for (int j = 0; j < MEASURED; j++)
-        to[j] = j < Q ? y[j] : source(e, k, row, e->measured_from[i * (MEASURED - Q) + j - Q]);
+        to[j] = j < Q ? y[j] : source(e, at, e->measured_from[i * (MEASURED - Q) + j - Q]);
     if (plain)
         return;
     if (e->noise)
         for (int j = 0; j < MEASURED; j++)
-            to[j] += e->noise[(row * e->agents + i) * MEASURED + j];
+            to[j] += e->noise[(at->row * e->agents + i) * MEASURED + j];
     if (!e->sensor_gain)
         return;
     for (int j = 0; j < MEASURED; j++) {
-        const int64_t at = i * MEASURED + j;
-        to[j] = rounded(to[j] + e->sensor_offset[at], e->sensor_resolution[at]);
-        if (e->sensor_gain[at] != 1 && k > 0)
-            to[j] = before[j] + e->sensor_gain[at] * (to[j] - before[j]);
+        const int64_t which = i * MEASURED + j;
+        to[j] = rounded(to[j] + e->sensor_offset[which], e->sensor_resolution[which]);
+        if (e->sensor_gain[which] != 1 && at->k > 0)
+            to[j] = before[j] + e->sensor_gain[which] * (to[j] - before[j]);
     }
 }
 
-/* Measure at point k and put what is sent there into its slot. */
-FOR_EACH_AGENT void send(const Engine *e, int64_t k, int64_t slot, int64_t row, int64_t i,
-                         const int plain)
+/* Measure at a point and put down what is sent there. */
+FOR_EACH_AGENT void send(const Engine *e, const Place *at, int64_t i, const int plain)
 {
-    double *to = message(e, slot, i);
-    measure(e, k, row, i, plain);
-    controller_send(controller(e, i), own_values(e, i), memory(e, k, i), measured(e, k, i), to);
+    double *to = message(at, i);
+    measure(e, at, i, plain);
+    controller_send(controller(e, i), own_values(e, i), memory(at, i), measured(at, i), to);
     if (!plain && e->resolution > 0)
         for (int j = 0; j < MESSAGE; j++)
             to[j] = rounded(to[j], e->resolution);
 }
 
 /* Whether state and estimate of agent i are finite and within the limit. */
-FOR_EACH_AGENT int within(const Engine *e, int64_t k, int64_t i)
+FOR_EACH_AGENT int within(const Engine *e, const Place *at, int64_t i)
 {
-    const double *xhat = memory(e, k, i), *x = reading(e, k, i) + Q;
+    const double *xhat = memory(at, i), *x = reading(e, at, i) + Q;
     int good = 1;
     for (int j = 0; j < M; j++) {
         good &= fabs(xhat[j]) <= e->limit;
@@ -244,9 +265,9 @@ FOR_EACH_AGENT int within(const Engine *e, int64_t k, int64_t i)
 FOR_EACH_AGENT void record(const Engine *e, const Point *p, int64_t i)
 {
     const int64_t at = p->row * e->agents + i;
-    const double *values = reading(e, p->k, i);
+    const double *values = reading(e, &p->here, i);
     if (e->xhat_rows)
-        copy(e->xhat_rows + at * M, memory(e, p->k, i), M);
+        copy(e->xhat_rows + at * M, memory(&p->here, i), M);
     if (e->u_rows)
         copy(e->u_rows + at * P, e->u + i * P, P);
     if (e->applied_rows)
@@ -256,12 +277,12 @@ FOR_EACH_AGENT void record(const Engine *e, const Point *p, int64_t i)
     if (e->x_rows && e->shows_states)
         copy(e->x_rows + at * M, values + Q, M);
     if (e->measured_rows)
-        copy(e->measured_rows + at * MEASURED, measured(e, p->k, i), MEASURED);
+        copy(e->measured_rows + at * MEASURED, measured(&p->here, i), MEASURED);
 }
 
 FOR_EACH_AGENT void note_lowest(const Engine *e, const Point *p, int64_t i, double t)
 {
-    const double *x = e->shows_states ? reading(e, p->k, i) + Q : memory(e, p->k, i);
+    const double *x = e->shows_states ? reading(e, &p->here, i) + Q : memory(&p->here, i);
     double lowest = x[0];
     for (int j = 1; j < M; j++)
         if (!(lowest <= x[j]))
@@ -294,7 +315,7 @@ FOR_EACH_AGENT int ends(const Engine *e, int64_t k, int64_t i, const int plain)
 /* What agent i remembers at the next point goes here: at once, or when its period is over. */
 FOR_EACH_AGENT double *remembers(const Engine *e, const Point *p, int64_t i, const int plain)
 {
-    return plain || e->every[i] == 1 ? memory(e, p->k + 1, i) : e->pending + i * MEMORY;
+    return plain || e->every[i] == 1 ? memory(&p->next, i) : e->pending + i * MEMORY;
 }
 
 /* What the actuator of agent i makes of its input. */
@@ -333,11 +354,11 @@ FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agen
     for (int l = 0; l < n; l++) {
         gather(e, p, agents[l], disagreement, silence, plain);
         put_column(all, l, disagreement, MESSAGE);
-        put_column(before, l, memory(e, p->k, agents[l]), MEMORY);
+        put_column(before, l, memory(&p->here, agents[l]), MEMORY);
     }
     for (int l = n; l < B; l++) { /* what is left of the block repeats the last agent */
         put_column(all, l, disagreement, MESSAGE);
-        put_column(before, l, memory(e, p->k, agents[n - 1]), MEMORY);
+        put_column(before, l, memory(&p->here, agents[n - 1]), MEMORY);
     }
     controller_block(controller(e, agents[0]), n, p->t, all, before, after, u, applied);
     for (int l = 0; l < n; l++) {
@@ -359,8 +380,8 @@ FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agen
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
         gather(e, p, i, disagreement, silence, plain);
-        controller_step(controller(e, i), own_values(e, i), p->t, measured(e, p->k, i), disagreement,
-                        silence, memory(e, p->k, i), remembers(e, p, i, plain), e->u + i * P,
+        controller_step(controller(e, i), own_values(e, i), p->t, measured(&p->here, i), disagreement,
+                        silence, memory(&p->here, i), remembers(e, p, i, plain), e->u + i * P,
                         e->applied + i * P);
     }
 }
@@ -405,7 +426,7 @@ FOR_EACH_AGENT void set_inputs(const Engine *e, const Point *p, int64_t i, const
     for (int64_t extra = e->first_extra[i]; extra < e->first_extra[i + 1]; extra++) {
         double value = e->extra_bias[extra];
         for (int64_t term = e->first_term[extra]; term < e->first_term[extra + 1]; term++)
-            value += e->term_weight[term] * source(e, p->k, p->row, e->term[term]);
+            value += e->term_weight[term] * source(e, &p->here, e->term[term]);
         *to++ = value;
     }
 }
@@ -414,12 +435,12 @@ FOR_EACH_AGENT void set_inputs(const Engine *e, const Point *p, int64_t i, const
 static void carry(const Engine *e, const Point *p, int64_t i)
 {
     const Fmus *f = e->fmus;
-    copy(reading(e, p->k + 1, i), reading(e, p->k, i), f->reading_at[i + 1] - f->reading_at[i]);
+    copy(reading(e, &p->next, i), reading(e, &p->here, i), f->reading_at[i + 1] - f->reading_at[i]);
     if (i >= e->agents)
         return;
-    copy(measured(e, p->k + 1, i), measured(e, p->k, i), MEASURED);
-    copy(memory(e, p->k + 1, i), memory(e, p->k, i), MEMORY);
-    copy(message(e, p->next, i), message(e, p->slot, i), MESSAGE);
+    copy(measured(&p->next, i), measured(&p->here, i), MEASURED);
+    copy(memory(&p->next, i), memory(&p->here, i), MEMORY);
+    copy(message(&p->next, i), message(&p->here, i), MESSAGE);
 }
 
 /* An instance did not do what it was told: the run ends, or goes on without it. */
@@ -443,10 +464,10 @@ FOR_EACH_AGENT void arrived(const Engine *e, const Point *p, int64_t i, Signal *
     if (i >= e->agents)
         return;
     if (!plain && e->every[i] != 1)
-        copy(memory(e, p->k + 1, i), e->pending + i * MEMORY, MEMORY);
+        copy(memory(&p->next, i), e->pending + i * MEMORY, MEMORY);
     if (plain || !e->measures_others)
-        send(e, p->k + 1, p->next, p->row + 1, i, plain);
-    if (!within(e, p->k + 1, i))
+        send(e, &p->next, i, plain);
+    if (!within(e, &p->next, i))
         signal->diverging = 1;
 }
 
@@ -475,7 +496,7 @@ FOR_EACH_AGENT int step(const Engine *e, const Member *me, const Point *p, int64
         failed(e, p, i, me->report, signal);
         return !signal->failed; /* the rest of this point is recorded */
     }
-    if (fmus_read(f, i, reading(e, p->k + 1, i), me->scratch, me->report))
+    if (fmus_read(f, i, reading(e, &p->next, i), me->scratch, me->report))
         arrived(e, p, i, signal, plain);
     else
         failed(e, p, i, me->report, signal);
@@ -489,10 +510,10 @@ static void read_first(const Engine *e, const Member *me, const Point *p, Signal
 {
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++)
-        if (!fmus_read(e->fmus, i, reading(e, p->k, i), me->scratch, me->report))
+        if (!fmus_read(e->fmus, i, reading(e, &p->here, i), me->scratch, me->report))
             signal->failed = 1;
     for (int64_t i = me->first_other; i < me->end_other; i++)
-        if (!fmus_read(e->fmus, i, reading(e, p->k, i), me->scratch, me->report))
+        if (!fmus_read(e->fmus, i, reading(e, &p->here, i), me->scratch, me->report))
             signal->failed = 1;
 }
 
@@ -501,13 +522,13 @@ static void send_first(const Engine *e, const Member *me, const Point *p, Signal
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++) {
         if (begins(e, p->k, i, 0))
-            send(e, p->k, p->slot, 0, i, 0);
-        if (!within(e, p->k, i))
+            send(e, &p->here, i, 0);
+        if (!within(e, &p->here, i))
             signal->diverging = 1;
     }
     if (me->id == 0)
-        controller_leader_send(e->controllers, memory(e, p->k, e->agents),
-                               message(e, p->slot, e->agents));
+        controller_leader_send(e->controllers, memory(&p->here, e->agents),
+                               message(&p->here, e->agents));
 }
 
 /* Measure and send at k + 1, when the readings of all instances are there. */
@@ -516,7 +537,7 @@ static void send_late(const Engine *e, const Member *me, const Point *p, Signal 
     *signal = (Signal){0};
     for (int64_t i = me->first; i < me->end; i++)
         if (ends(e, p->k, i, 0))
-            send(e, p->k + 1, p->next, p->row + 1, i, 0);
+            send(e, &p->next, i, 0);
 }
 
 /* Wait for what was posted by this thread. */
@@ -527,7 +548,7 @@ static void wait_for_posted(const Engine *e, const Member *me, const Point *p, i
     for (int64_t i = from; i < to; i++) {
         if (!e->fmus->is_remote[i] || !ends(e, p->k, i, 0))
             continue;
-        if (remote->wait(remote->context, i, reading(e, p->k + 1, i), me->report))
+        if (remote->wait(remote->context, i, reading(e, &p->next, i), me->report))
             arrived(e, p, i, signal, 0);
         else
             failed(e, p, i, me->report, signal);
@@ -593,7 +614,7 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
     }
     if (me->id != 0)
         return;
-    const double *leader = memory(e, p->k, e->agents);
+    const double *leader = memory(&p->here, e->agents);
     if (e->s_rows)
         copy(e->s_rows + p->row * M, leader, M);
     if (e->time)
@@ -601,11 +622,11 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
     if (e->extra_rows)
         for (int64_t j = 0; j < e->extra_columns; j++)
             e->extra_rows[p->row * e->extra_columns + j] =
-                source(e, p->k, p->row, e->recorded[j]);
+                source(e, &p->here, e->recorded[j]);
     if (go) {
-        controller_leader(e->controllers, p->t, leader, memory(e, p->k + 1, e->agents));
-        controller_leader_send(e->controllers, memory(e, p->k + 1, e->agents),
-                               message(e, p->next, e->agents));
+        controller_leader(e->controllers, p->t, leader, memory(&p->next, e->agents));
+        controller_leader_send(e->controllers, memory(&p->next, e->agents),
+                               message(&p->next, e->agents));
     }
     signal->halt |= __atomic_load_n(&e->halt, __ATOMIC_ACQUIRE) != 0;
 }
@@ -628,8 +649,12 @@ static void run(Member *me)
 {
     Team *team = me->team;
     const Engine *e = team->e;
-    Point p = {e->k, e->k % e->slots, (e->k + 1) % e->slots, 0, e->arrivals, time_of(e, e->k),
-               (double)e->period / 1e9};
+    Point p = {.k = e->k,
+               .t = time_of(e, e->k),
+               .h = (double)e->period / 1e9,
+               .arrivals = e->arrivals,
+               .here = place(e, e->k, 0),
+               .next = place(e, e->k + 1, 1)};
     Signal all = {0};
     if (e->ready == 0) {
         read_first(e, me, &p, &team->signals[p.k & 1][me->id]);
@@ -655,9 +680,8 @@ static void run(Member *me)
         }
         me->diverging = all.diverging;
         p.t = time_of(e, ++p.k);
-        p.row++;
-        p.slot = p.next;
-        p.next = p.next + 1 < e->slots ? p.next + 1 : 0;
+        p.here = p.next;
+        p.next = place(e, p.k + 1, ++p.row + 1);
         if (p.arrivals)
             p.arrivals += e->all_arcs;
     }
