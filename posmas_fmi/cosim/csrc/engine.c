@@ -344,38 +344,47 @@ FOR_EACH_AGENT void take_column(double *to, const double *from, int at, int n)
         to[j] = from[j * CONTROLLER_BLOCK + at];
 }
 
-/* The inputs of some agents with one controller, and what they remember next. */
-FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agents, int n,
-                            const int plain)
+/* The inputs of some agents with one controller, and what they remember next; where a column is
+ * left, the leader's memory too. Returns whether it was. */
+FOR_EACH_AGENT int control(const Engine *e, const Point *p, const int64_t *agents, int n,
+                           const int with_leader, const int plain)
 {
     enum { B = CONTROLLER_BLOCK };
     double all[MESSAGE * B], before[MEMORY * B], after[MEMORY * B], u[P * B], applied[P * B];
-    double disagreement[MESSAGE], silence[2];
+    double driven[B], disagreement[MESSAGE], silence[2];
+    const int leads = with_leader && n < B;
+    for (int l = 0; l < B; l++)
+        driven[l] = l < n;
     for (int l = 0; l < n; l++) {
         gather(e, p, agents[l], disagreement, silence, plain);
         put_column(all, l, disagreement, MESSAGE);
         put_column(before, l, memory(&p->here, agents[l]), MEMORY);
     }
-    for (int l = n; l < B; l++) { /* what is left of the block repeats the last agent */
+    for (int l = n; l < B; l++) {
         put_column(all, l, disagreement, MESSAGE);
-        put_column(before, l, memory(&p->here, agents[n - 1]), MEMORY);
+        put_column(before, l, memory(&p->here, leads ? e->agents : agents[n - 1]), MEMORY);
     }
-    controller_block(controller(e, agents[0]), n, p->t, all, before, after, u, applied);
+    controller_block(controller(e, agents[0]), n + leads, p->t, driven, all, before, after, u,
+                     applied);
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
         take_column(remembers(e, p, i, plain), after, l, MEMORY);
         take_column(e->u + i * P, u, l, P);
         take_column(e->applied + i * P, applied, l, P);
     }
+    if (leads)
+        take_column(memory(&p->next, e->agents), after, n, MEMORY);
+    return leads;
 }
 
 #else
 
 enum { CONTROLLER_BLOCK = 1 };
 
-FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agents, int n,
-                            const int plain)
+FOR_EACH_AGENT int control(const Engine *e, const Point *p, const int64_t *agents, int n,
+                           const int with_leader, const int plain)
 {
+    (void)with_leader;
     double disagreement[MESSAGE], silence[2];
     for (int l = 0; l < n; l++) {
         const int64_t i = agents[l];
@@ -384,16 +393,18 @@ FOR_EACH_AGENT void control(const Engine *e, const Point *p, const int64_t *agen
                         silence, memory(&p->here, i), remembers(e, p, i, plain), e->u + i * P,
                         e->applied + i * P);
     }
+    return 0;
 }
 
 #endif
 
-/* Let those of the agents first … end - 1 act whose step begins; the others only listen. */
-FOR_EACH_AGENT void control_those(const Engine *e, const Point *p, int64_t first, int64_t end,
-                                  const int plain)
+/* Let those of the agents first … end - 1 act whose step begins; the others only listen. Returns
+ * whether the leader's memory was computed besides. */
+FOR_EACH_AGENT int control_those(const Engine *e, const Point *p, int64_t first, int64_t end,
+                                 const int with_leader, const int plain)
 {
     int64_t acting[CONTROLLER_BLOCK];
-    int n = 0;
+    int n = 0, led = 0;
     for (int64_t i = first; i < end; i++) {
         if (!begins(e, p->k, i, plain)) {
             if (e->held)
@@ -401,16 +412,17 @@ FOR_EACH_AGENT void control_those(const Engine *e, const Point *p, int64_t first
             continue;
         }
         if (!plain && n && e->controller[i] != e->controller[acting[0]]) {
-            control(e, p, acting, n, plain);
+            control(e, p, acting, n, 0, plain);
             n = 0;
         }
         acting[n++] = i;
     }
     if (n)
-        control(e, p, acting, n, plain);
+        led = control(e, p, acting, n, plain && with_leader, plain);
     for (int64_t i = first; i < end; i++)
         if (begins(e, p->k, i, plain))
             actuate(e, p, i, plain);
+    return led;
 }
 
 /* Put the inputs of an instance together: u of an agent, then what it is wired to. */
@@ -570,11 +582,11 @@ static int is_plain(const Engine *e)
 
 /* The agents of one thread at a point; returns whether the instances after them are to be stepped. */
 FOR_EACH_AGENT int advance_agents(const Engine *e, const Member *me, const Point *p, int steps,
-                                  int64_t *posted, Signal *signal, const int plain)
+                                  int *led, int64_t *posted, Signal *signal, const int plain)
 {
     for (int64_t first = me->first; first < me->end; first += CONTROLLER_BLOCK) {
         const int64_t end = first + CONTROLLER_BLOCK < me->end ? first + CONTROLLER_BLOCK : me->end;
-        control_those(e, p, first, end, plain);
+        *led = control_those(e, p, first, end, me->id == 0 && end == me->end, plain);
         for (int64_t i = first; i < end; i++) {
             record(e, p, i);
             note_lowest(e, p, i, p->t);
@@ -586,25 +598,26 @@ FOR_EACH_AGENT int advance_agents(const Engine *e, const Member *me, const Point
 }
 
 static int advance_plain_agents(const Engine *e, const Member *me, const Point *p, int steps,
-                                Signal *signal)
+                                int *led, Signal *signal)
 {
     int64_t none = 0;
-    return advance_agents(e, me, p, steps, &none, signal, 1);
+    return advance_agents(e, me, p, steps, led, &none, signal, 1);
 }
 
 static int advance_any_agents(const Engine *e, const Member *me, const Point *p, int steps,
-                              int64_t *posted, Signal *signal)
+                              int *led, int64_t *posted, Signal *signal)
 {
-    return advance_agents(e, me, p, steps, posted, signal, 0);
+    return advance_agents(e, me, p, steps, led, posted, signal, 0);
 }
 
 /* Control and record at a point; if `go`, step to the next one and read there. */
 static void advance(const Engine *e, const Member *me, const Point *p, int go, Signal *signal)
 {
     int64_t posted = 0;
+    int led = 0;
     *signal = (Signal){0};
-    int steps = me->team->plain ? advance_plain_agents(e, me, p, go, signal)
-                                : advance_any_agents(e, me, p, go, &posted, signal);
+    int steps = me->team->plain ? advance_plain_agents(e, me, p, go, &led, signal)
+                                : advance_any_agents(e, me, p, go, &led, &posted, signal);
     for (int64_t i = me->first_other; i < me->end_other && steps; i++)
         steps = step(e, me, p, i, &posted, signal, 0);
     if (posted) {
@@ -624,7 +637,8 @@ static void advance(const Engine *e, const Member *me, const Point *p, int go, S
             e->extra_rows[p->row * e->extra_columns + j] =
                 source(e, &p->here, e->recorded[j]);
     if (go) {
-        controller_leader(e->controllers, p->t, leader, memory(&p->next, e->agents));
+        if (!led)
+            controller_leader(e->controllers, p->t, leader, memory(&p->next, e->agents));
         controller_leader_send(e->controllers, memory(&p->next, e->agents),
                                message(&p->next, e->agents));
     }

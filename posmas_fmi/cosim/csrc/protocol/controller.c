@@ -22,8 +22,9 @@ void controller_step(const Controller *c, const double *own, double t, const dou
                      double *next, double *u, double *applied)
 {
     (void)own, (void)measured, (void)silence;
-    step(c, t, (const Lanes(*)[MESSAGE])disagreement, (const Lanes(*)[M])memory, (Lanes(*)[M])next,
-         (Lanes(*)[P])u, (Lanes(*)[P])applied);
+    const Lanes driven = 1;
+    step(c, t, &driven, (const Lanes(*)[MESSAGE])disagreement, (const Lanes(*)[M])memory,
+         (Lanes(*)[M])next, (Lanes(*)[P])u, (Lanes(*)[P])applied);
 }
 
 void controller_leader(const Controller *c, double t, const double *memory, double *next)

@@ -55,10 +55,12 @@ void controller_step(const Controller *c, const double *own, double t, const dou
 
 /* The same for many agents at once, to the same bits: columns are agents, so disagreement is
  * (MESSAGE, CONTROLLER_BLOCK). All columns are to hold numbers, those of the first `agents` count.
+ * Where `driven` (CONTROLLER_BLOCK) is 0 and not 1 the model runs free: there is room for the leader.
  * A controller without this function is called for one agent at a time. */
 #define CONTROLLER_BLOCK 16
-void controller_block(const Controller *c, int agents, double t, const double *disagreement,
-                      const double *memory, double *next, double *u, double *applied);
+void controller_block(const Controller *c, int agents, double t, const double *driven,
+                      const double *disagreement, const double *memory, double *next, double *u,
+                      double *applied);
 
 /* The leader: its memory (MEMORY) at t + h, and what it sends (MESSAGE). */
 void controller_leader(const Controller *c, double t, const double *memory, double *next);

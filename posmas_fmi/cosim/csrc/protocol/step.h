@@ -83,9 +83,10 @@ LANES_INLINE void propagate(const Controller *c, double t, const Lanes x[][M], c
     }
 }
 
-/* As controller_step, for all lanes of GROUPS vectors. */
-LANES_INLINE void step(const Controller *c, double t, const Lanes disagreement[][MESSAGE],
-                       const Lanes memory[][M], Lanes next[][M], Lanes u[][P], Lanes applied[][P])
+/* As controller_step, for all lanes of GROUPS vectors; what is held counts `driven` times. */
+LANES_INLINE void step(const Controller *c, double t, const Lanes *driven,
+                       const Lanes disagreement[][MESSAGE], const Lanes memory[][M],
+                       Lanes next[][M], Lanes u[][P], Lanes applied[][P])
 {
     Lanes held[GROUPS][M];
     for (int k = 0; k < GROUPS; k++) {
@@ -93,6 +94,8 @@ LANES_INLINE void step(const Controller *c, double t, const Lanes disagreement[]
         agent_sec(u[k], applied[k]);
         set_product(held[k], c->B, applied[k], M, P);
         add_product(held[k], c->E, disagreement[k] + M, M, Q);
+        for (int i = 0; i < M; i++)
+            held[k][i] *= driven[k];
     }
     propagate(c, t, memory, held, next);
 }
