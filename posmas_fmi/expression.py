@@ -241,7 +241,10 @@ class _ExactNumpy(NumPyPrinter):
 
 
 class _ExactC(C99CodePrinter):
-    """C code with each rational as the nearest double, and no functions outside math.h."""
+    """C code with each rational as the nearest double, only what math.h has by the standard."""
+
+    def __init__(self) -> None:
+        super().__init__({"math_macros": {}})  # M_SQRT2 and the like are no standard C
 
     def _print_Rational(self, expr: sympy.Rational) -> str:
         return repr(float(expr))
@@ -257,6 +260,9 @@ class _ExactC(C99CodePrinter):
 
     def _print_Pi(self, expr: sympy.Expr) -> str:
         return repr(math.pi)
+
+    def _print_Exp1(self, expr: sympy.Expr) -> str:
+        return repr(math.e)
 
     def _print_sign(self, expr: sympy.Expr) -> str:
         x = self._print(expr.args[0])
@@ -277,10 +283,10 @@ class _LanesC(_ExactC):
         code = str(self._print(expr))
         return code if expr.free_symbols else f"lanes_of({code})"
 
-    def _print_Function(self, expr: sympy.Function) -> str:
+    def _print_Function(self, expr: sympy.Expr) -> str:
         name, args = expr.func.__name__, expr.args
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         if name in self._OWN:
             return f"lanes_{name}({self._print(args[0])})"
         return f"lanes_each({name}, {self._print(args[0])})"
@@ -290,28 +296,28 @@ class _LanesC(_ExactC):
 
     def _print_Abs(self, expr: sympy.Expr) -> str:
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         return f"lanes_abs({self._print(expr.args[0])})"
 
     def _print_sign(self, expr: sympy.Expr) -> str:
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         return f"lanes_sign({self._print(expr.args[0])})"
 
     def _print_Min(self, expr: sympy.Expr) -> str:
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         return _nested("lanes_min", [self.lanes(arg) for arg in expr.args])
 
     def _print_Max(self, expr: sympy.Expr) -> str:
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         return _nested("lanes_max", [self.lanes(arg) for arg in expr.args])
 
     def _print_Pow(self, expr: sympy.Pow) -> str:
         base, exponent = expr.args
         if not expr.free_symbols:
-            return str(_ExactC().doprint(expr))
+            return repr(float(expr))
         if exponent == sympy.Rational(1, 2):
             return f"lanes_sqrt({self._print(base)})"
         if exponent.is_Integer and (exponent == -1 or 2 <= exponent <= 4):

@@ -81,8 +81,9 @@ LANES_INLINE Lanes lanes_max(Lanes a, Lanes b)
 LANES_INLINE Lanes lanes_sign(Lanes x)
 {
     const Lanes zero = {0}, one = lanes_of(1);
-    return lanes_select(LANES_WHERE(x > zero), one, zero) -
-           lanes_select(LANES_WHERE(x < zero), one, zero);
+    const Lanes sign = lanes_select(LANES_WHERE(x > zero), one, zero) -
+                       lanes_select(LANES_WHERE(x < zero), one, zero);
+    return lanes_select(LANES_WHERE(x != x), x, sign);
 }
 
 /* A function of math.h, lane by lane. */
