@@ -20,6 +20,7 @@ from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
+from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
 from posmas_fmi.fmu.units import Conversion
 
 log = logging.getLogger(__name__)
@@ -73,6 +74,8 @@ class FmuPlant:
     fmus : Fmus
     input_at, reading_at : (instances + 1,) array of int
         Where inputs and readings of each instance begin.
+    start_values : tuple of StartFinding
+        Those that could not be set, or that an FMU changed.
 
     Raises
     ------
@@ -104,9 +107,12 @@ class FmuPlant:
                 )
                 for spec in specs
             )
+            findings: list[StartFinding] = []
             self._instances = [
-                stack.enter_context(_start(files[spec.fmu], spec, stop)) for spec in specs
+                stack.enter_context(_start(files[spec.fmu], spec, stop, findings)) for spec in specs
             ]
+            self.start_values = tuple(findings)
+            _tell(findings)
             self.fmus = Fmus(
                 self._instances,
                 [spec.inputs for spec in specs],
@@ -208,10 +214,24 @@ def _compiled_loop() -> ctypes.CDLL | None:
         return None
 
 
-def _start(file: FmuFile, spec: PlantSpec, stop: float) -> FmuInstance:
+def _start(
+    file: FmuFile, spec: PlantSpec, stop: float, findings: list[StartFinding]
+) -> FmuInstance:
     instance = file.instantiate(spec.name)
-    instance.initialise(_existing(file, spec.values), stop=stop, tolerance=spec.tolerance)
+    values, refused = settable(file.about, _existing(file, spec.values), spec.name)
+    instance.initialise(values, stop=stop, tolerance=spec.tolerance)
+    findings += [*refused, *read_back(instance, values)]
     return instance
+
+
+def _tell(findings: list[StartFinding]) -> None:
+    for one in grouped(findings):
+        who = one["instances"]
+        more = f" and {len(who) - 1} more" if len(who) > 1 else ""
+        log.warning(
+            "%s: %s%s: start value %r %s: %s",
+            *(one["fmu"], who[0], more, one["variable"], one["what"], one["message"]),
+        )
 
 
 def converted(about: About, ports: PortMap) -> PortMap:
@@ -253,8 +273,11 @@ def _existing(file: FmuFile, values: Mapping[str, Any]) -> dict[str, Any]:
     """Spread arrays over elements where the FMU (version 2) has no arrays; refuse unknown names."""
     spread: dict[str, Any] = {}
     for name, value in values.items():
+        if name in file.variables or isinstance(value, str):
+            spread[name] = value
+            continue
         array = np.asarray(value, dtype=float)
-        if name in file.variables or array.ndim == 0:
+        if array.ndim == 0:
             spread[name] = value
             continue
         for index in np.ndindex(array.shape):

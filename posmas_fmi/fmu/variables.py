@@ -47,6 +47,8 @@ class Variable:
         Of each dimension; a name is that of the structural parameter that says it.
     text : str or None
         Start value of a variable that is no number.
+    initial : str
+        ``exact``, ``approx``, ``calculated``, or nothing.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Variable:
     relative: bool = False
     lengths: tuple[int | str, ...] = ()
     text: str | None = None
+    initial: str = ""
 
     @classmethod
     def read(cls, source: Any) -> Variable:
@@ -87,6 +90,7 @@ class Variable:
                 for d in source.dimensions or ()
             ),
             text=source.start if source.type == "String" else None,
+            initial=source.initial or "",
         )
 
     @property

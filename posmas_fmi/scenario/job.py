@@ -16,12 +16,14 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, Outcome, Progress, System
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.start_values import grouped
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
@@ -132,9 +134,15 @@ def run(
         (folder / name).unlink(missing_ok=True)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     _write_json(folder / "design.json", facts)
-    _write_json(folder / "manifest.json", manifest(scenario, files, choice, command))
+    told = manifest(scenario, files, choice, command)
+    _write_json(folder / "manifest.json", told)
+
+    def started(plant: FmuPlant) -> None:
+        told["start_values"] = grouped(plant.start_values)
+        _write_json(folder / "manifest.json", told)
+
     began = time.perf_counter()
-    outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress)
+    outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress, started)
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
@@ -167,6 +175,7 @@ def _simulate(
     choice: engine.Choice,
     folder: Path,
     progress: Callable[[str], Progress | None],
+    started: Callable[[FmuPlant], None],
 ) -> tuple[Outcome, Outcome | None]:
     """Run with the design, then once more without control for comparison."""
     variables = (*RECORDED, "x_baseline") if scenario.baseline else RECORDED
@@ -174,6 +183,7 @@ def _simulate(
         instances.start() as plant,
         _recorder(scenario, designed.network, instances, folder, variables) as recorder,
     ):
+        started(plant)
         system = make_system(scenario, designed, instances)
         split = instances.recorded
 

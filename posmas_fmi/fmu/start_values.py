@@ -1,0 +1,155 @@
+"""Start values: what an FMU does not let one set, and what it made of those that were set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.errors import FmuError
+from posmas_fmi.fmu.about import About
+from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.variables import Variable
+
+_SAME = {"Float32": 1e-6}  # relative, by type: rounding of what was set
+_SAME_DOUBLE = 1e-12
+
+
+@attrs.frozen
+class StartFinding:
+    """A start value that the FMU does not have as it was asked for.
+
+    Attributes
+    ----------
+    instance, fmu, variable : str
+    what : {"not set", "changed", "not read back"}
+    message : str
+        Why, or what the values are.
+    """
+
+    instance: str
+    fmu: str
+    variable: str
+    what: str
+    message: str
+
+
+def settable(
+    about: About, values: Mapping[str, Any], instance: str = ""
+) -> tuple[dict[str, Any], list[StartFinding]]:
+    """Return the values that may be set before initialisation, and findings about the others.
+
+    Parameters
+    ----------
+    about : About
+    values : mapping
+        By name; all names are known to the FMU.
+    instance : str
+        Name for the findings.
+    """
+    kept, findings = {}, []
+    for name, value in values.items():
+        why = _not_settable(about.variable(name))
+        if why:
+            findings.append(StartFinding(instance, about.path.name, name, "not set", why))
+        else:
+            kept[name] = value
+    return kept, findings
+
+
+def _not_settable(variable: Variable) -> str:
+    if variable.variability == "constant":
+        return "it is a constant"
+    if variable.causality in ("calculatedParameter", "independent"):
+        return f"its causality is {variable.causality}"
+    # some exporters give a start value and forget to say that it counts
+    if variable.initial == "calculated" and variable.start is None and variable.text is None:
+        return "the FMU calculates it (initial is calculated)"
+    return ""
+
+
+def read_back(instance: FmuInstance, values: Mapping[str, Any]) -> list[StartFinding]:
+    """Return findings about values that an initialised instance no longer has.
+
+    Parameters
+    ----------
+    instance : FmuInstance
+    values : mapping
+        What was set, by name.
+    """
+    findings, about = [], instance.file.about
+    for name, wanted, found in _pairs(instance, values):
+        if isinstance(found, FmuError):
+            what, message = "not read back", found.message
+        elif _same(about.variable(name), wanted, found):
+            continue
+        else:
+            what, message = "changed", f"set to {_shown(wanted)}, and it is {_shown(found)}"
+        findings.append(StartFinding(instance.name, about.path.name, name, what, message))
+    return findings
+
+
+def _pairs(instance: FmuInstance, values: Mapping[str, Any]) -> Iterable[tuple[str, Any, Any]]:
+    """Name, what was set and what is there; all numbers in one call where that works."""
+    numbers = {n: np.ravel(np.asarray(v, float)) for n, v in values.items() if not _is_text(v)}
+    if numbers:
+        try:
+            found = instance.read(instance.file.ports(tuple(numbers)))
+        except FmuError:
+            for name, wanted in numbers.items():
+                yield name, wanted, _attempt(instance, name)
+        else:
+            begin = 0
+            for name, wanted in numbers.items():
+                yield name, wanted, found[begin : begin + wanted.size]
+                begin += wanted.size
+    for name, value in values.items():
+        if _is_text(value):
+            yield name, value, _attempt(instance, name)
+
+
+def _attempt(instance: FmuInstance, name: str) -> Any:
+    try:
+        value = instance.get(name)
+    except FmuError as error:
+        return error
+    return value if _is_text(value) else np.ravel(np.asarray(value, float))
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _same(variable: Variable, wanted: Any, found: Any) -> bool:
+    if _is_text(wanted) or _is_text(found):
+        return bool(wanted == found)
+    near = np.isclose(found, wanted, rtol=_SAME.get(variable.type, _SAME_DOUBLE), atol=0.0)
+    return bool(np.all(near))
+
+
+def _shown(value: Any) -> str:
+    if _is_text(value):
+        return repr(value)
+    if value.size == 1:
+        return f"{value[0]:.9g}"
+    numbers = [f"{one:.9g}" for one in value[:4]]
+    return f"[{', '.join(numbers)}{', …' if value.size > 4 else ''}]"
+
+
+def grouped(findings: Iterable[StartFinding]) -> list[dict[str, Any]]:
+    """Return findings as a manifest shows them: what is the same for many instances stands once.
+
+    Examples
+    --------
+    >>> same = [StartFinding(name, "a.fmu", "m", "not set", "it is a constant") for name in "ab"]
+    >>> grouped(same)[0]["instances"]
+    ['a', 'b']
+    """
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for one in findings:
+        key = (one.fmu, one.variable, one.what, one.message)
+        groups.setdefault(key, []).append(one.instance)
+    names = ("fmu", "variable", "what", "message")
+    return [{**dict(zip(names, key, strict=True)), "instances": who} for key, who in groups.items()]

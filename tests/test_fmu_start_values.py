@@ -1,0 +1,101 @@
+"""Start values that an FMU does not take as they are: found, told, written to the manifest."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+from fmu_scenarios import one_fmu
+
+from posmas_fmi import load, run
+from posmas_fmi.errors import InputError
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.start_values import read_back, settable
+
+PUMP = """
+from pythonfmu import Fmi2Causality as C, Fmi2Initial as I, Fmi2Slave, Fmi2Variability as V
+from pythonfmu import Real, String
+
+
+class Pump(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.limit, self.density, self.area, self.label = 5.0, 1.0, 2.0, ""
+        self.u, self.y = 0.0, 0.0
+        self.register_variable(Real("limit", causality=C.parameter, variability=V.tunable))
+        self.register_variable(
+            Real("density", causality=C.local, variability=V.constant, initial=I.exact)
+        )
+        self.register_variable(
+            Real("area", causality=C.calculatedParameter, variability=V.fixed, initial=I.calculated)
+        )
+        self.register_variable(Real("u", causality=C.input))
+        self.register_variable(Real("y", causality=C.output))
+        self.register_variable(String("label", causality=C.parameter, variability=V.tunable))
+
+    def exit_initialization_mode(self):
+        self.limit = min(self.limit, 10.0)
+        self.label = self.label[:3]
+
+    def do_step(self, t, h):
+        self.y = min(self.u, self.limit)
+        return True
+"""
+VALUES = {"limit": 12.0, "density": 2.0, "area": 3.0, "label": "long name", "u": 0.1}
+
+
+@pytest.fixture(scope="module")
+def pump(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu is not installed")
+    folder = tmp_path_factory.mktemp("pythonfmu")
+    (folder / "pump.py").write_text(PUMP, encoding="utf-8")
+    return Path(builder.FmuBuilder.build_FMU(folder / "pump.py", dest=folder))
+
+
+def test_each_finding_says_what_and_why(pump: Path) -> None:
+    with FmuFile(pump) as file, file.instantiate("p") as instance:
+        kept, refused = settable(file.about, VALUES, "p")
+        assert {f.variable: f.message for f in refused} == {
+            "density": "it is a constant",
+            "area": "its causality is calculatedParameter",
+        }
+        assert list(kept) == ["limit", "label", "u"]
+        instance.initialise(kept)
+        changed = {f.variable: (f.what, f.message) for f in read_back(instance, kept)}
+    assert changed == {
+        "limit": ("changed", "set to 12, and it is 10"),
+        "label": ("changed", "set to 'long name', and it is 'lon'"),
+    }
+
+
+def test_nothing_is_said_where_all_is_as_asked(pump: Path) -> None:
+    with FmuFile(pump) as file, file.instantiate("p") as instance:
+        values = {"limit": 1 / 3, "label": "abc"}
+        instance.initialise(values)
+        assert read_back(instance, values) == []
+
+
+def scenario(pump: Path, folder: Path, parameters: str) -> str:
+    return one_fmu(folder, pump, '"u"', '"y"', f"parameters = {{{parameters}}}")
+
+
+def test_a_run_tells_and_keeps_them(
+    pump: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = scenario(pump, tmp_path, 'limit = 12.0, area = 3.0, label = "abc"')
+    with caplog.at_level(logging.WARNING):
+        run(load(path), tmp_path / "out", report=False)
+    told = json.loads((tmp_path / "out" / "manifest.json").read_text())["start_values"]
+    assert [(t["variable"], t["what"], t["instances"]) for t in told] == [
+        ("area", "not set", ["1", "2"]),
+        ("limit", "changed", ["1", "2"]),
+    ]
+    assert "1 and 1 more: start value 'limit' changed: set to 12, and it is 10" in caplog.text
+
+
+def test_a_name_that_is_not_there_is_a_mistake(pump: Path, tmp_path: Path) -> None:
+    path = scenario(pump, tmp_path, "limits = 1.0")
+    with pytest.raises(InputError, match="no variable 'limits'; did you mean 'limit'"):
+        run(load(path), tmp_path / "out", report=False)
