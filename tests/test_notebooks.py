@@ -1,6 +1,7 @@
 """The notebooks run, and their pages show what they are."""
 
 import runpy
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,7 @@ def test_the_page_shows_text_and_code_of_the_notebook(name, render):
     assert render["source_of"](page) == code, AGAIN.format(name)
     for cell in cells:
         assert cell.source in page, AGAIN.format(name)
+    assert tempfile.gettempdir() not in page, "a place of one machine"
 
 
 def test_every_page_belongs_to_a_notebook():

@@ -53,6 +53,12 @@ MISTAKES = {
     "negative s0": ("s0 = [1.0, 1.0]", "s0 = [1.0, -1.0]", ["$.leader.s0"], "non-negative"),
     "initial": ("{uniform = [0.0, 2.0]}", "{uniform = [2.0, 0.0]}", ["$.initial.x.uniform"], "low"),
     "initial size": ("xhat = 0.0", "xhat = [1.0, 2.0, 3.0]", ["$.initial.xhat"], "2"),
+    "initial of another FMU": (
+        'fmu = "positive_agent"',
+        'fmu = "mine.fmu"',
+        ["$.initial.x"],
+        "$.plant.parameters",
+    ),
     "until": ("until = 10.0", "until = 10.001", ["$.scenario.until"], "multiple"),
     "name": ('"paper-example-1"', '"../up"', ["$.scenario.name"], "folder"),
     "fmi": ('fmu = "positive_agent"', 'fmu = "positive_agent"\nfmi = 1', ["$.plant.fmi"], "2 or 3"),

@@ -204,7 +204,7 @@ class _Builder:
         if agent and network and clock:
             random = np.random.default_rng(abs(tables.scenario.seed))
             n, m = network.N, agent.m
-            x0 = self.attempt(lambda: initial(tables.initial.x, n, m, random, "$.initial.x"))
+            x0 = self.attempt(lambda: _start(tables, n, m, random))
             xhat0 = self.attempt(
                 lambda: initial(tables.initial.xhat, n, m, random, "$.initial.xhat")
             )
@@ -458,6 +458,17 @@ def initial(value: Any, n: int, m: int, random: np.random.Generator, place: str)
     if array.size not in (1, m):
         raise InputError(f"expected one value or {m}, one per state (got {array.size})", place)
     return np.array(np.broadcast_to(array, (n, m)))
+
+
+def _start(tables: ScenarioFile, n: int, m: int, random: np.random.Generator) -> Array:
+    x = tables.initial.x
+    if x is not None and tables.plant.fmu != "positive_agent":
+        raise InputError(
+            f"only positive_agent takes it; {tables.plant.fmu} starts from its own start values: "
+            "set them in $.plant.parameters, or in [[plant.override]] for single agents",
+            "$.initial.x",
+        )
+    return initial(0.0 if x is None else x, n, m, random, "$.initial.x")
 
 
 def _leader(s0: list[float], m: int, place: str) -> Array:

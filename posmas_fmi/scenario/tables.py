@@ -338,9 +338,18 @@ class LeaderTable:
 
 @attrs.frozen
 class InitialTable:
-    """``[initial]``: a number, one value per state, one row per agent, or ``{uniform = […]}``."""
+    """``[initial]``: a number, one value per state, one row per agent, or ``{uniform = […]}``.
 
-    x: float | list[float] | Matrix | Uniform = 0.0
+    Attributes
+    ----------
+    x : number, list or table
+        States at the start, of `positive_agent` only; another FMU starts from its start values, see
+        `parameters` in ``[plant]`` and ``[[plant.override]]``. Default 0.
+    xhat : number, list or table
+        Estimates at the start. At or below the states is what the proof of positivity asks for.
+    """
+
+    x: float | list[float] | Matrix | Uniform | None = None
     xhat: float | list[float] | Matrix | Uniform = 0.0
 
 
