@@ -1,18 +1,25 @@
 from __future__ import annotations
 
+import attrs
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
+from posmas_fmi.agent import linear_agent
+from posmas_fmi.certify import Loop, quadratic
 from posmas_fmi.design import DesignSettings, design, lmi
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2
+from posmas_fmi.design.rounding import nearest
+from posmas_fmi.design.sampled import sampled_feedback
 from posmas_fmi.errors import DesignError
+from posmas_fmi.network import Network, network_from_arcs
 
 
 def kappa(example: object, pin: int) -> float:
     agent, network = example.agent(), example.network(pin)  # type: ignore[attr-defined]
     graph = lmi.graph_scalar(network, (agent.m_l, agent.m_h))
     # the reference figures leave |H|l out of the Metzler condition
-    found = lmi.feedback_gain(agent, network, example.phi, graph.value, 6, agent.A)  # type: ignore[attr-defined]
+    found = lmi.feedback_gain(agent, network, example.phi, graph, 6, agent.A)  # type: ignore[attr-defined]
     assert found.proof.positive
     return found.kappa
 
@@ -85,3 +92,105 @@ def test_a_solver_that_does_not_finish_is_a_clear_error(monkeypatch: pytest.Monk
     program = cp.Problem(cp.Minimize(cp.trace(X)), [X >> seed @ seed.T])
     with pytest.raises(DesignError, match="not done after"):
         solver.solve(program, "feedback")
+
+
+TWO_INPUTS = linear_agent(
+    [[-0.8, 0.5, 0.3], [0.4, -0.7, 0.3], [0.2, 0.3, -0.5]],
+    [[1.0, 0.1], [0.2, 0.7], [0.0, 0.3]],
+    np.eye(3),
+    sector=(0.8, 1.2),
+)
+DIGRAPH = network_from_arcs(3, [(1, 2), (2, 3), (2, 1)], [1])
+PATH = network_from_arcs(3, [(1, 2), (2, 1), (2, 3), (3, 2)], [1])
+
+
+@pytest.mark.parametrize("network", [DIGRAPH, PATH], ids=["digraph", "undirected"])
+@pytest.mark.parametrize("kind", ["diagonal", "symmetric"])
+def test_gains_of_several_inputs_are_rounded_first_and_proved_as_they_are(
+    network: Network, kind: str
+) -> None:
+    """Three digits, a coupling that is no power of two: K differs from -B'V/phi."""
+    agent, phi = TWO_INPUTS, 3.0
+    sector = (agent.m_l, agent.m_h)
+    graph = (
+        lmi.graph_scalar(network, sector)
+        if kind == "diagonal"
+        else quadratic.symmetric_scalar(network, sector)
+    )
+    if graph is None:
+        assert network is DIGRAPH
+        return
+    found = lmi.feedback_gain(agent, network, phi, graph, 3, agent.A)
+    assert found.proof.positive
+    assert (nearest(found.K, 3) == found.K).all()
+    off = np.abs(phi * found.K + agent.B.T * found.V).max()
+    assert off > 1e-6
+    rng = np.random.default_rng(3)
+    M = network.pinned_laplacian.toarray()
+    W = np.diag(graph.Theta) if kind == "diagonal" else M
+    for _ in range(500):
+        z = rng.normal(size=(3, 3))
+        s = rng.choice(sector, (3, 2)) * (phi * M @ z @ found.K.T)
+        dz = z @ agent.A.T + s @ agent.B.T
+        value = np.sum(W * ((z * found.V) @ z.T))
+        change = 2 * np.sum(W * ((z * found.V) @ dz.T))
+        assert change <= -2 * found.kappa * value + 1e-9 * value
+
+
+@pytest.mark.parametrize("network", [DIGRAPH, PATH], ids=["digraph", "undirected"])
+def test_quadratic_function_of_the_sampled_loop_falls_in_every_period(network: Network) -> None:
+    agent = attrs.evolve(EXAMPLE_1.agent("tanh"), lipschitz=0.2 if network is DIGRAPH else 0.02)
+    h, ell = 0.001, float(np.max(agent.ell))
+    graph = lmi.graph_scalar(network, (0.9, 1.2))
+    if network is PATH:
+        graph = quadratic.symmetric_scalar(network, (0.9, 1.2))
+    assert graph is not None
+    base = lmi.feedback_gain(agent, network, 10.0, graph, 6, agent.A)
+    base = lmi.scaled_feedback(agent, 10.0, graph, base, 0.7, 6)
+    loop = Loop(agent, network, base.K, np.zeros((2, 2)), phi=10.0, period=h)
+    proof = sampled_feedback(loop, 10.0 * base.K, np.diag(base.V), graph, base.kappa)
+    assert proof is not None
+    assert proof.factor < 1
+    rng = np.random.default_rng(0)
+    M = network.pinned_laplacian.toarray()
+    W = np.diag(graph.Theta) if graph.kind == "diagonal" else M
+    worst = 0.0
+    for _ in range(300):
+        z = rng.normal(size=(3, 2)) if rng.random() < 0.5 else np.outer(network.p, [1.0, 1.0])
+        s = rng.choice([0.9, 1.2], (3, 1)) * (10.0 * M @ z @ base.K.T)
+        after = np.empty_like(z)
+        for i in range(3):
+            J = agent.A + agent.H @ np.diag(rng.choice([-ell, ell], 2))
+            flow = expm(np.block([[J, np.eye(2)], [np.zeros((2, 4))]]) * h)
+            after[i] = flow[:2, :2] @ z[i] + flow[:2, 2:] @ agent.B @ s[i]
+        ratio = np.sum(W * (after @ proof.P @ after.T)) / np.sum(W * (z @ proof.P @ z.T))
+        worst = max(worst, ratio)
+        assert ratio <= proof.factor**2 * (1 + 1e-9)
+    assert worst > 0.9
+
+
+def test_a_refuted_condition_is_a_no_that_names_it() -> None:
+    made = design(TWO_INPUTS, DIGRAPH, DesignSettings(method="lmi", phi=3.0), period=4.0)
+    failing = made.certificate.failing
+    assert made.certificate.certified == "no"
+    assert {c.name for c in failing} == {
+        "T: observer keeps signs for every tau <= h",
+        "T: controller keeps signs for every tau <= h",
+    }
+    assert all(c.refuted for c in failing)
+
+
+def test_a_graph_scalar_of_many_agents_is_proved_in_floating_point() -> None:
+    n = 40
+    arcs = [(i, i + 1) for i in range(1, n)] + [(i + 1, i) for i in range(1, n, 2)]
+    network = network_from_arcs(n, arcs, [1, 9, 17, 25, 33])
+    found = lmi.graph_scalar(network, (0.9, 1.1))
+    assert "verified Cholesky" in found.proof.method
+    M = network.pinned_laplacian.toarray()
+    T = np.diag(found.Theta) @ M
+    S = 1.0 * (T + T.T) - 0.01 * M.T @ np.diag(found.T) @ M - np.diag(found.Theta**2 / found.T)
+    least = np.linalg.eigvalsh(S - found.value * np.diag(found.Theta))[0]
+    assert 0 < found.proof.bound <= least
+    above = found.value + 1.1 * least / found.Theta.min()
+    proof = quadratic.graph_proof(network, (0.9, 1.1), above, found.Theta, found.T)
+    assert not proof.positive

@@ -29,6 +29,8 @@ class Condition:
         Estimate, proved bound and method.
     detail : str
         Where it is tight or fails: the agent, the entry, what would help.
+    refuted : bool
+        Whether it is proved that the condition, as it stands, does not hold.
     """
 
     name: str
@@ -36,9 +38,12 @@ class Condition:
     margin: float
     proof: str
     detail: str = ""
+    refuted: bool = False
 
     @classmethod
-    def from_margin(cls, name: str, margin: float, proof: str, detail: str = "") -> Condition:
+    def from_margin(
+        cls, name: str, margin: float, proof: str, detail: str = "", refuted: bool = False
+    ) -> Condition:
         """Condition that holds iff its proved margin is positive; NaN counts as failed.
 
         Examples
@@ -48,7 +53,7 @@ class Condition:
         """
         if math.isnan(margin):
             margin = -math.inf
-        return cls(name, margin > 0, float(margin), proof, detail)
+        return cls(name, margin > 0, float(margin), proof, detail, refuted and not margin > 0)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON form."""
@@ -58,6 +63,7 @@ class Condition:
             "margin": json_number(self.margin),
             "proof": self.proof,
             "detail": self.detail,
+            "refuted": self.refuted,
         }
 
 

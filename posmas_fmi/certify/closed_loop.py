@@ -185,6 +185,7 @@ def _continuous_condition(rate: Rate | None, feedback: Feedback, positive: bool)
         f"rho = {rate.estimate:.9g}, proved rho >= {rate.value:.9g} 1/s "
         f"with v = [{', '.join(f'{x:.6g}' for x in rate.v)}], {form}, interval arithmetic",
         f"weakest at {feedback.weakest}",
+        rate.refuted,
     )
 
 
@@ -201,6 +202,7 @@ def _not_held(loop: Loop, unreached: tuple[int, ...]) -> Certificate:
             "would give 1 = -(L - D)^-1 d <= 0; exact",
             "errata 1 and 2: with the printed sign the pinned agent is pushed away from the "
             f'leader (sum of d = {d:g}); use protocol = "corrected"',
+            refuted=True,
         )
     else:
         names = ", ".join(network.names[i] for i in unreached[:10])
@@ -211,6 +213,7 @@ def _not_held(loop: Loop, unreached: tuple[int, ...]) -> Certificate:
             "the rows of L + D of the agents that the leader does not reach sum to zero over "
             "these agents: singular; exact",
             f"no path from the leader to agent(s) {names}",
+            refuted=True,
         )
     return Certificate(
         assumptions=assumptions(loop),

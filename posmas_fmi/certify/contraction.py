@@ -23,11 +23,14 @@ class Rate:
         The same in plain floating point.
     v : (m,) array
         The weights of the states, positive.
+    refuted : bool
+        Whether it is proved that no v gives ρ > 0, or r < 1.
     """
 
     value: float
     estimate: float
     v: Array
+    refuted: bool = False
 
 
 def perron_vector(M: Array) -> Array:
@@ -62,7 +65,9 @@ def continuous_rate(A_high: Interval, feedback: Feedback) -> Rate | None:
     value = matmul(majorant, point(v[:, None])).high[:, 0]
     bound = float(np.nextafter(value / v, np.inf).max())
     estimate = float(np.linalg.eigvals(majorant.high).real.max())
-    return Rate(-bound, -estimate, v)
+    # Collatz-Wielandt: no v gives more than the smallest quotient of this one
+    most = float(np.nextafter(matmul(majorant, point(v[:, None])).low[:, 0] / v, -np.inf).min())
+    return Rate(-bound, -estimate, v, most >= 0)
 
 
 def metzler_majorant(J: Interval) -> Interval:

@@ -11,7 +11,7 @@ from posmas_fmi.certify.enclosure import point, product
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.expression import Array
-from posmas_fmi.interval import Interval
+from posmas_fmi.interval import Interval, Mask
 
 Indices = np.ndarray[Any, np.dtype[np.intp]]
 VACUOUS = 1.0  # margin where there is no entry that could fail
@@ -33,6 +33,12 @@ def margin_of(values: Interval, where: Array | None = None) -> tuple[float, tupl
     return (least if least != 0.0 else float(np.finfo(float).tiny)), index
 
 
+def _below(values: Interval, where: Mask | None = None) -> bool:
+    """Whether an entry is proved negative."""
+    low = values.high < 0
+    return bool((low if where is None else low & where).any())
+
+
 def _entry(name: str, index: tuple[int, ...] | None) -> str:
     if index is None:
         return "no entry could fail"
@@ -48,6 +54,7 @@ def gain_sign(feedback: Feedback) -> Condition:
         margin,
         f"least entry >= {margin:.6g}, interval arithmetic",
         _entry(symbol, index),
+        _below(feedback.N),
     )
 
 
@@ -55,7 +62,11 @@ def non_positive_gain(loop: Loop) -> Condition:
     """``K ≤ 0``: neighbours and leader pull upwards."""
     margin, index = margin_of(-point(loop.K))
     return Condition.from_margin(
-        "P: K <= 0", margin, f"largest entry {float(loop.K.max()):.6g}, exact", _entry("K", index)
+        "P: K <= 0",
+        margin,
+        f"largest entry {float(loop.K.max()):.6g}, exact",
+        _entry("K", index),
+        bool((loop.K > 0).any()),
     )
 
 
@@ -78,6 +89,7 @@ def metzler(loop: Loop, feedback: Feedback) -> Condition:
         margin,
         f"least off-diagonal entry >= {margin:.6g} 1/s, interval arithmetic",
         f"{_entry('the matrix', index)}, binding at {feedback.strongest}",
+        _below(value, off),
     )
 
 
@@ -115,6 +127,7 @@ def between_samples(flow: Flow, feedback: Feedback, h: float) -> Condition:
                 "interval arithmetic",
                 f"{_entry('the matrix', tuple(entry))}; a shorter period or a smaller gain "
                 f"helps; binding at {feedback.strongest}",
+                _refuted(flow, N, ends, float(ends.times[corners[k]])),
             )
         pieces = ends.halve(pieces)
     margin = VACUOUS if np.isinf(proved) else max(proved, float(np.finfo(float).tiny))
@@ -125,6 +138,19 @@ def between_samples(flow: Flow, feedback: Feedback, h: float) -> Condition:
         f"{count} pieces of [0, h], interval arithmetic",
         f"binding at {feedback.strongest}",
     )
+
+
+def _refuted(flow: Flow, N: Interval, ends: _Ends, tau: float) -> bool:
+    """Whether an entry is proved negative at that time."""
+    bounds = flow.shifted_bounds(np.array([tau]))
+    batch = Interval(N.low[None], N.high[None])
+    own = np.where(ends.off, bounds.first.high, bounds.zeroth.high)
+    own = np.where(ends.flat, bounds.second.high, own)
+    taken = np.where(ends.flat, product(bounds.held_second, batch).low, 0.0)
+    taken = np.where(~ends.flat, product(bounds.held, batch).low, taken)
+    spent = np.where(ends.off, taken, np.nextafter(taken * tau, -np.inf))
+    with np.errstate(invalid="ignore"):
+        return bool((np.nextafter(own - spent, np.inf) < 0).any())
 
 
 class _Ends:

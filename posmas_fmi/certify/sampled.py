@@ -36,7 +36,11 @@ def sampled_factor(flow: Flow, feedback: Feedback, h: float) -> Rate | None:
     value = matmul(T, point(v[:, None])).high[:, 0]
     bound = float(np.nextafter(value / v, np.inf).max())
     estimate = float(np.abs(np.linalg.eigvals(T.high)).max())
-    return Rate(bound, estimate, v) if math.isfinite(bound) else None
+    if not math.isfinite(bound):
+        return None
+    # Collatz-Wielandt: no v gives less than the smallest quotient of this one
+    least = np.nextafter(matmul(T, point(v[:, None])).low[:, 0] / v, -np.inf).min()
+    return Rate(bound, estimate, v, bool((T.low >= 0).all() and least >= 1))
 
 
 def rate_of(factor: Rate | None, h: float) -> float | None:
@@ -63,4 +67,5 @@ def contracts(factor: Rate | None, feedback: Feedback, h: float, positive: bool)
         f"r = {factor.estimate:.9g}, proved r <= {factor.value:.9g} per period of {h:g} s "
         f"({speed}) with v = [{weights}], {form}, interval arithmetic",
         f"weakest at {feedback.weakest}",
+        factor.refuted,
     )

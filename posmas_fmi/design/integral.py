@@ -16,7 +16,8 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.certify.proof import Definiteness, identity, positive_definite, rational
-from posmas_fmi.design.lmi import GraphScalar, graph_scalar, lipschitz_norm
+from posmas_fmi.certify.quadratic import GraphScalar
+from posmas_fmi.design.lmi import graph_scalar, lipschitz_norm
 from posmas_fmi.design.rounding import nearest
 from posmas_fmi.design.solver import cvxpy, solve
 from posmas_fmi.errors import DesignError

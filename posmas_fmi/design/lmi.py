@@ -7,6 +7,8 @@ Numbers are rounded first; what is proved is proved about the rounded ones, in e
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from fractions import Fraction
 from typing import Any
 
@@ -15,6 +17,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent, Assumption
 from posmas_fmi.certify.certificate import Certificate, Condition
+from posmas_fmi.certify.loop import Loop
 from posmas_fmi.certify.proof import (
     Definiteness,
     diagonal,
@@ -23,9 +26,18 @@ from posmas_fmi.certify.proof import (
     positive_definite,
     rational,
 )
-from posmas_fmi.design.gains import certified
+from posmas_fmi.certify.quadratic import (
+    GraphScalar,
+    diagonal_scalar,
+    feedback_matrix,
+    graph_proof,
+    mismatch,
+    symmetric_scalar,
+)
+from posmas_fmi.design.gains import certified, loop_of
 from posmas_fmi.design.result import Design
-from posmas_fmi.design.rounding import nearest
+from posmas_fmi.design.rounding import nearest, towards_zero
+from posmas_fmi.design.sampled import sampled_condition, sampled_feedback, sampled_observer
 from posmas_fmi.design.settings import DesignSettings
 from posmas_fmi.design.solver import cvxpy, solve
 from posmas_fmi.errors import DesignError
@@ -37,24 +49,6 @@ _BISECTIONS = 40
 _FACTORS = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of K, to leave room for sampling
 _OBSERVER_FACTOR = 3.0  # in a quadratic design fast observers cost much gain
 _SAFETY = 1e-5  # relative distance of proved scalars from their optima
-
-
-@attrs.frozen(eq=False)
-class GraphScalar:
-    """``γ₀`` with the diagonals that prove it.
-
-    Attributes
-    ----------
-    value : float
-        Proved: the graph matrix at this γ is positive definite.
-    Theta, T : (N,) array
-    proof : Definiteness
-    """
-
-    value: float
-    Theta: Array
-    T: Array
-    proof: Definiteness
 
 
 @attrs.frozen(eq=False)
@@ -77,19 +71,6 @@ class Feedback:
     kappa: float
     theta: float
     proof: Definiteness
-
-
-def graph_matrix(
-    network: Network, sector: tuple[float, float], gamma: float, Theta: Array, T: Array
-) -> Any:
-    """``[[m(ΘM̂ + M̂ᵀΘ) - ρ² M̂ᵀTM̂ - γΘ, Θ], [Θ, T]]`` in rational arithmetic, (2N, 2N)."""
-    M = rational(network.pinned_laplacian.toarray())
-    low, high = (Fraction(repr(float(x))) for x in sector)
-    mean, half = (high + low) / 2, (high - low) / 2
-    theta, t = diagonal(Theta), diagonal(T)
-    weighted = theta @ M
-    top = mean * (weighted + weighted.T) - half**2 * (M.T @ t @ M) - Fraction(gamma) * theta
-    return np.block([[top, theta], [theta, t]])
 
 
 def graph_scalar(network: Network, sector: tuple[float, float]) -> GraphScalar:
@@ -115,9 +96,9 @@ def graph_scalar(network: Network, sector: tuple[float, float]) -> GraphScalar:
     value, Theta, T = found
     for step in (_SAFETY, 1e-3, 1e-2, 1e-1):
         gamma = value - step * abs(value) - 1e-12
-        proof = positive_definite(graph_matrix(network, sector, gamma, Theta, T))
+        proof = graph_proof(network, sector, gamma, Theta, T)
         if proof.positive:
-            return GraphScalar(gamma, Theta, T, proof)
+            return diagonal_scalar(network, sector, gamma, Theta, T, proof)
     raise DesignError("no graph scalar could be proved for this network", "$.network")
 
 
@@ -184,26 +165,11 @@ def lipschitz_norm(agent: Agent) -> float:
     return float(np.sqrt(ell.sum(axis=0).max() * ell.sum(axis=1).max())) * (1 + 1e-12)
 
 
-def feedback_matrix(
-    agent: Agent, gamma: Fraction, V: Any, theta: Fraction, kappa: Fraction, beta: Fraction
-) -> Any:
-    """Minus the feedback LMI in the coordinates ``V = Π⁻¹``, in rational arithmetic, (2m, 2m).
-
-    ``[[VA + AᵀV - γ VBBᵀV + θ VHHᵀV + 2κV, βI], [βI, -θI]] ≺ 0`` is the LMI of theory.md times
-    diag(V, I) on both sides.
-    """
-    A, H, B = rational(agent.A), rational(agent.H), rational(agent.B)
-    one, D = identity(agent.m), diagonal(V)
-    VA, VB, VH = D @ A, D @ B, D @ H
-    top = VA + VA.T - gamma * (VB @ VB.T) + theta * (VH @ VH.T) + 2 * kappa * D
-    return -np.block([[top, beta * one], [beta * one, -theta * one]])
-
-
 def feedback_gain(
     agent: Agent,
     network: Network,
     phi: float,
-    gamma: float,
+    graph: GraphScalar,
     digits: int,
     room: Array | None,
 ) -> Feedback:
@@ -222,10 +188,13 @@ def feedback_gain(
     """
     cp = cvxpy()
     m, A, H, B = agent.m, agent.A, agent.H, agent.B
-    beta = lipschitz_norm(agent)
+    gamma = graph.value
+    beta = lipschitz_norm(agent) * float(np.sqrt(graph.spread))
     if not np.isfinite(beta):
         raise DesignError("route L needs a finite Lipschitz bound of g", "$.agent.lipschitz")
-    # Π and the factor of BBᵀ scale together: Π is normalised, V = σ Π⁻¹
+    # Π and the factor of BBᵀ scale together: Π is normalised, V = σ Π⁻¹, whatever the unit of u
+    unit = float(np.abs(B).max(initial=0.0)) or 1.0
+    B = B / unit
     pi, theta, sigma, slack = (
         cp.Variable(m, pos=True),
         cp.Variable(pos=True),
@@ -243,6 +212,7 @@ def feedback_gain(
         cp.sum(pi) == m,
         pi >= 1e-6,
         sigma <= 1e6,
+        sigma >= 1e-6,
         slack <= 1,
     ]
     if room is not None:
@@ -261,14 +231,19 @@ def feedback_gain(
         middle = 0.5 * (low + high)
         kappa.value = middle
         if _feasible(program, slack):
-            low, best = middle, (pi.value / sigma.value, float(theta.value / sigma.value))
+            factor = float(sigma.value) / unit**2
+            low, best = middle, (pi.value / factor, max(float(theta.value), 1e-12) / factor)
         else:
             high = middle
         if high - low < 1e-6 * max(1.0, abs(high)):
             break
     if best is None:
-        raise DesignError("no diagonal quadratic feedback was found", "$.design.method")
-    return _proved_feedback(agent, phi, gamma, beta, best, low, digits)
+        raise DesignError(
+            "no diagonal quadratic feedback keeps signs: A + phi m_h max(Lp)_ii BK - |H|l Metzler "
+            "leaves no room for a gain",
+            "$.design.method",
+        )
+    return _proved_feedback(agent, phi, graph, best, low, digits)
 
 
 def _feasible(program: Any, slack: Any) -> bool:
@@ -282,77 +257,91 @@ def _feasible(program: Any, slack: Any) -> bool:
 def _proved_feedback(
     agent: Agent,
     phi: float,
-    gamma: float,
-    beta: float,
+    graph: GraphScalar,
     found: tuple[Array, float],
     kappa: float,
     digits: int,
 ) -> Feedback:
-    """Round V, form K from it, and prove a rate for the rounded numbers."""
-    V = nearest(1.0 / found[0], digits)
-    K = nearest(-(agent.B.T * V) / phi, 15)
-    return prove_feedback(agent, phi, gamma, K, V, found[1], kappa)
+    """Form K from V, round it, and prove a rate for the rounded gain."""
+    V = 1.0 / found[0]
+    K = towards_zero(-(agent.B.T * V) / phi, digits)
+    return prove_feedback(agent, phi, graph, K, V, found[1], kappa)
 
 
 def prove_feedback(
-    agent: Agent, phi: float, gamma: float, K: Array, V: Array, theta: float, kappa: float
+    agent: Agent,
+    phi: float,
+    graph: GraphScalar,
+    K: Array,
+    V: Array,
+    theta: float,
+    kappa: float,
 ) -> Feedback:
-    """Prove the rate κ, or one a little below it, for a given K.
+    """Prove the rate κ, or the largest below it that K as it is given still has.
 
     Parameters
     ----------
     K : (p, m) array
-        ``-BᵀV/φ``; with one input V is taken from it, so that the proof is about K as it ships.
+        Near ``-BᵀV/φ``.
     V : (m,) array
-    theta, kappa : float
-        From the semidefinite program.
+    theta : float
+        Multiplier of the Lipschitz bound.
+    kappa : float
+        Largest rate that is looked for.
     """
-    beta, exact = lipschitz_norm(agent), _scaling_of(agent, phi, K, V)
+    judge = _Judge(agent, phi, graph, K, V, theta)
+    if judge.least(kappa) <= 0:
+        low, high = -float(np.abs(agent.A).sum()) - 1.0, kappa
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if judge.least(middle) > 0 else (low, middle)
+        kappa = low
     outcome = Definiteness(float("nan"), -np.inf, "not tried")
     for step in (_SAFETY, 1e-4, 1e-3, 1e-2):
         rate = kappa - step * max(abs(kappa), 1e-3)
-        outcome = positive_definite(
-            feedback_matrix(
-                agent, Fraction(gamma), exact, Fraction(theta), Fraction(rate), Fraction(beta)
-            )
-        )
+        outcome = positive_definite(judge.matrix(rate))
         if outcome.positive:
             return Feedback(K, V, rate, theta, outcome)
     return Feedback(K, V, -np.inf, theta, outcome)
 
 
-def _scaling_of(agent: Agent, phi: float, K: Array, V: Array) -> Any:
-    """V with ``K = -BᵀV/φ`` exactly where there is one input; else V, with K to 15 digits."""
-    exact = rational(V)
-    if agent.p == 1:
-        B, gains, coupling = rational(agent.B)[:, 0], rational(K)[0], Fraction(repr(float(phi)))
-        for k in range(agent.m):
-            if B[k] != 0:
-                exact[k] = -coupling * gains[k] / B[k]
-    return exact
+@attrs.frozen(eq=False)
+class _Judge:
+    """The matrix that proves a rate of one gain."""
+
+    agent: Agent
+    phi: float
+    graph: GraphScalar
+    K: Array
+    V: Array
+    theta: float
+
+    def least(self, rate: float) -> float:
+        """Smallest eigenvalue in plain floating point."""
+        return float(np.linalg.eigvalsh(np.array(self.matrix(rate), dtype=float))[0])
+
+    def matrix(self, rate: float) -> Any:
+        agent = self.agent
+        return feedback_matrix(
+            (agent.A, agent.B, agent.H),
+            Fraction(repr(float(self.phi))) * rational(self.K),
+            diagonal(self.V),
+            self.graph,
+            Fraction(self.theta),
+            Fraction(rate),
+            lipschitz_norm(agent),
+            mismatch(agent.B, self.phi * self.K, np.diag(self.V), self.graph),
+        )
 
 
 def scaled_feedback(
-    agent: Agent, phi: float, gamma: float, base: Feedback, factor: float
+    agent: Agent, phi: float, graph: GraphScalar, base: Feedback, factor: float, digits: int
 ) -> Feedback:
     """Return the same feedback times a factor below one, with the rate that it still has."""
     V, theta = base.V * factor, base.theta / factor
-    K = nearest(base.K * factor, 6)
-    beta = lipschitz_norm(agent)
-    exact = _scaling_of(agent, phi, K, V)
-
-    def least(rate: float) -> float:
-        M = feedback_matrix(
-            agent, Fraction(gamma), exact, Fraction(theta), Fraction(rate), Fraction(beta)
-        )
-        return float(np.linalg.eigvalsh(np.array(M, dtype=float))[0])
-
+    K = towards_zero(base.K * factor, digits)
     size = float(np.abs(agent.A).sum()) + 1.0
-    low, high = -size, max(base.kappa, 0.0) + size
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if least(middle) > 0 else (low, middle)
-    return prove_feedback(agent, phi, gamma, K, V, theta, low)
+    return prove_feedback(agent, phi, graph, K, V, theta, max(base.kappa, 0.0) + size)
 
 
 def observer_gain(agent: Agent, rate: float, digits: int) -> tuple[Array, float, Definiteness]:
@@ -415,21 +404,12 @@ def design(
 ) -> Design:
     """Design by route L, then see what certificates P and T say about the shipped gains."""
     network.require_reached()
-    graph = graph_scalar(network, (agent.m_l, agent.m_h))
-    room = agent.A - agent.H_ell
-    feedback = feedback_gain(agent, network, settings.phi, graph.value, settings.digits, room)
-    if feedback.kappa <= 0:
-        raise DesignError(
-            f"route L proves no contraction: kappa = {feedback.kappa:.4g} 1/s with gamma_0 = "
-            f"{graph.value:.4g}; another pinned agent changes gamma_0, and "
-            'method = "contraction" may do better',
-            "$.design.method",
-        )
+    graph, feedback = _best(agent, network, settings)
     estimate = _observer(agent, network, settings, period, feedback.kappa)
     made = None
     for factor in _FACTORS:
         if factor < 1.0:
-            weaker = scaled_feedback(agent, settings.phi, graph.value, feedback, factor)
+            weaker = scaled_feedback(agent, settings.phi, graph, feedback, factor, settings.digits)
             if weaker.kappa <= 0:
                 break
             feedback = weaker
@@ -438,9 +418,46 @@ def design(
         if not any("controller" in name or " BK" in name for name in failing):
             break
     assert made is not None
+    loop = loop_of(agent, network, made.K, made.E, settings, period)
     return attrs.evolve(
-        made, certificate=_with_route_l(made.certificate, graph, feedback, estimate)
+        made, certificate=_with_route_l(made.certificate, loop, graph, feedback, estimate)
     )
+
+
+def _best(agent: Agent, network: Network, settings: DesignSettings) -> tuple[GraphScalar, Feedback]:
+    """Fastest of the quadratic feedbacks that the weightings of the network allow.
+
+    Raises
+    ------
+    DesignError
+        If none contracts.
+    """
+    sector, room = (agent.m_l, agent.m_h), agent.A - agent.H_ell
+    found: list[tuple[GraphScalar, Feedback]] = []
+    for graph in (graph_scalar(network, sector), symmetric_scalar(network, sector)):
+        if graph is not None:
+            with suppress(DesignError):
+                found.append(
+                    (
+                        graph,
+                        feedback_gain(agent, network, settings.phi, graph, settings.digits, room),
+                    )
+                )
+    best = max(found, key=lambda pair: pair[1].kappa, default=None)
+    if best is None:
+        raise DesignError(
+            "no diagonal quadratic feedback keeps signs: A + phi m_h max(Lp)_ii BK - |H|l Metzler "
+            "leaves no room for a gain",
+            "$.design.method",
+        )
+    if best[1].kappa <= 0:
+        raise DesignError(
+            f"route L proves no contraction: kappa = {best[1].kappa:.4g} 1/s with gamma_0 = "
+            f"{best[0].value:.4g}; another pinned agent changes gamma_0, and "
+            'method = "contraction" may do better',
+            "$.design.method",
+        )
+    return best
 
 
 @attrs.frozen(eq=False)
@@ -474,9 +491,13 @@ def _observer(
 
 
 def _with_route_l(
-    found: Certificate, graph: GraphScalar, feedback: Feedback, estimate: Estimate
+    found: Certificate, loop: Loop, graph: GraphScalar, feedback: Feedback, estimate: Estimate
 ) -> Certificate:
-    """Put route L in front; what P and T do not prove becomes an assumption, by name."""
+    """Put route L in front.
+
+    It takes the place of C, and of T where it proves the sampled loop. What else is refuted stays
+    as a condition that fails; what is neither proved nor refuted becomes an assumption.
+    """
     own = [
         Condition.from_margin(
             "L: graph scalar", graph.proof.bound, f"gamma_0 = {graph.value:.9g}: {graph.proof}"
@@ -489,30 +510,74 @@ def _with_route_l(
     ]
     if estimate.condition is not None:
         own.append(estimate.condition)
-    kept = [c for c in found.conditions if c.holds or c.name.startswith("network")]
-    dropped = [c for c in found.conditions if c not in kept]
+    rate, observer_rate = found.rate, found.observer_rate
+    replaced = []
+    for c in found.conditions:
+        if c.holds or not c.name.endswith("contracts"):
+            continue
+        if "controller" in c.name:
+            proved, rate = _instead(loop, graph, feedback)
+        elif estimate.condition is None:
+            continue
+        else:
+            proved, observer_rate = _instead_of_observer(loop, estimate)
+        if proved is not None:
+            replaced.append(c.name)
+            own += proved
+    rest = [c for c in found.conditions if c.name not in replaced]
+    kept = [c for c in rest if c.holds or c.refuted or c.name.startswith("network")]
+    dropped = [c for c in rest if c not in kept]
     assumed = list(found.assumptions)
-    if any(c.name.startswith("P:") or "keeps signs" in c.name for c in dropped):
+    if estimate.condition is None:
+        kept += [c for c in dropped if "observer" in c.name]
+        dropped = [c for c in dropped if c not in kept]
+    signs = [c for c in dropped if not c.name.endswith("contracts")]
+    if signs:
         assumed.append(
-            Assumption("positivity", "declared", _names("not proved entry by entry", dropped))
+            Assumption("positivity", "declared", _names("not proved entry by entry", signs))
         )
-    if any("contracts" in c.name for c in dropped) and found.period is not None:
+    speeds = [c for c in dropped if c.name.endswith("contracts")]
+    if speeds:
         assumed.append(
             Assumption(
                 "sampling",
                 "declared",
-                _names(f"a period of {found.period:g} s is taken as continuous", dropped),
+                _names(f"a period of {loop.period:g} s is taken as continuous", speeds),
             )
         )
-    if estimate.condition is None and any("observer" in c.name for c in dropped):
-        kept += [c for c in dropped if "observer" in c.name]
     return attrs.evolve(
         found,
         assumptions=tuple(assumed),
         conditions=(*own, *kept),
-        rate=found.rate if found.rate is not None else feedback.kappa,
-        observer_rate=found.observer_rate if found.observer_rate is not None else estimate.rate,
+        rate=rate if rate is not None else feedback.kappa,
+        observer_rate=observer_rate if observer_rate is not None else estimate.rate,
     )
+
+
+def _instead(
+    loop: Loop, graph: GraphScalar, feedback: Feedback
+) -> tuple[list[Condition] | None, float | None]:
+    """Return quadratic conditions that take the place of C or T of the controller, and the rate."""
+    if loop.period is None:
+        return [], feedback.kappa
+    gain = loop.phi * feedback.K
+    proof = sampled_feedback(loop, gain, np.diag(feedback.V), graph, feedback.kappa)
+    if proof is None:
+        return None, None
+    rate = -math.log(proof.factor) / loop.period
+    return [sampled_condition("L: sampled loop contracts", proof, loop.period)], rate
+
+
+def _instead_of_observer(
+    loop: Loop, estimate: Estimate
+) -> tuple[list[Condition] | None, float | None]:
+    if loop.period is None:
+        return [], estimate.rate
+    proof = sampled_observer(loop)
+    if proof is None:
+        return None, None
+    rate = -math.log(proof.factor) / loop.period
+    return [sampled_condition("L: sampled observer contracts", proof, loop.period)], rate
 
 
 def _names(text: str, dropped: list[Condition]) -> str:
