@@ -142,14 +142,14 @@ def between_samples(flow: Flow, feedback: Feedback, h: float) -> Condition:
 
 def _refuted(flow: Flow, N: Interval, ends: _Ends, tau: float) -> bool:
     """Whether an entry is proved negative at that time."""
-    bounds = flow.shifted_bounds(np.array([tau]))
-    batch = Interval(N.low[None], N.high[None])
-    own = np.where(ends.off, bounds.first.high, bounds.zeroth.high)
-    own = np.where(ends.flat, bounds.second.high, own)
-    taken = np.where(ends.flat, product(bounds.held_second, batch).low, 0.0)
-    taken = np.where(~ends.flat, product(bounds.held, batch).low, taken)
-    spent = np.where(ends.off, taken, np.nextafter(taken * tau, -np.inf))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
+        bounds = flow.shifted_bounds(np.array([tau]))
+        batch = Interval(N.low[None], N.high[None])
+        own = np.where(ends.off, bounds.first.high, bounds.zeroth.high)
+        own = np.where(ends.flat, bounds.second.high, own)
+        second, first = product(bounds.held_second, batch).low, product(bounds.held, batch).low
+        taken = np.where(ends.flat, second, first)
+        spent = np.where(ends.off, taken, np.nextafter(taken * tau, -np.inf))
         return bool((np.nextafter(own - spent, np.inf) < 0).any())
 
 
