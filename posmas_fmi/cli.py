@@ -63,6 +63,9 @@ def _run(arguments: argparse.Namespace) -> int:
     summary, certificate = result.summary, result.design.certificate
     if arguments.json:
         _print_json({**summary, "certified": certificate.certified, "folder": str(folder)})
+    elif summary["verdict"] == "compared" and "kpi" in summary:
+        _show_comparison(summary)
+        print(f"report     {folder / 'report.html'}")
     else:
         print(f"verdict    {summary['verdict']}")
         if summary["reason"]:
@@ -234,6 +237,22 @@ def _show_design(made: Design, as_json: bool) -> int:
         for note in made.notes:
             print(f"  note: {note}")
     return DONE if made.certificate.certified != "no" else NEGATIVE
+
+
+def _show_comparison(summary: dict[str, Any]) -> None:
+    """Key figures by controller, then which limits each of them breaks."""
+    found = summary["comparison"]
+    labels = {
+        k: f"{v['label']} [{v['unit']}]".removesuffix(" []") for k, v in summary["kpi"].items()
+    }
+    width = max(map(len, labels.values()))
+    print(" " * width + "".join(f"  {name:>12}" for name in found))
+    for key, label in labels.items():
+        cells = (_number(figures.get(key)) for figures in found.values())
+        print(f"{label:{width}}" + "".join(f"  {cell:>12}" for cell in cells))
+    for name, figures in found.items():
+        broken = [limit for limit, kept in figures.get("limits", {}).items() if kept is False]
+        print(f"{name}: {'breaks ' + ', '.join(broken) if broken else 'keeps every limit'}")
 
 
 def _show_linearisation(made: Linearisation) -> None:

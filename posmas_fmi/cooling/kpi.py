@@ -14,6 +14,8 @@ from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 
 BAND = 1.0  # K around the set-point that cooling units are specified to hold
+NOMINAL_PRESSURE = 100e3  # Pa across the primary circuit of a line at header 1 (assumed)
+WATER_DENSITY = 995.0  # kg/m³ at 32 °C
 _END = 0.1  # part of the run that "at the end" is the mean over
 _LEAST_CYCLE = 2.0  # K: smaller swings of the case do not count as thermal cycles
 
@@ -44,10 +46,14 @@ class KeyFigures:
         Thermal cycles of the case of 2 K or more, mean over the lines [1/h].
     hottest_case : float or None
         [K].
+    pump_energy : float or None
+        Hydraulic energy of the facility water through the valves, sum of the lines [J].
     messages_per_hour : float or None
         Over the network.
     lowest : float
         Lowest temperature above the facility supply, of any line [K].
+    lowest_supply : float
+        Lowest supply temperature, of any line [K].
     rms_by_line, worst_by_line : (N,) ndarray
         As above, of each line.
     """
@@ -63,8 +69,10 @@ class KeyFigures:
     strokes_per_hour: float | None
     cycles_per_hour: float | None
     hottest_case: float | None
+    pump_energy: float | None
     messages_per_hour: float | None
     lowest: float
+    lowest_supply: float
     rms_by_line: Array
     worst_by_line: Array
 
@@ -89,6 +97,8 @@ def key_figures(
     case: ArrayLike | None = None,
     class_limit: float | None = None,
     messages: int | None = None,
+    flow: ArrayLike | None = None,
+    header: ArrayLike | None = None,
 ) -> KeyFigures:
     """Compute the key figures of a run.
 
@@ -101,7 +111,7 @@ def key_figures(
     set_point : array_like
         Broadcast against `supply` [K]; of shape (n,) it is one for all lines.
     facility : array_like
-        Facility supply [K], a number or (n,).
+        Facility supply [K], a number, (n,) or (n, N).
     valve : (n, N) array_like, optional
         Positions, 0 to 1.
     case : (n, N) array_like, optional
@@ -110,6 +120,10 @@ def key_figures(
         From `posmas_fmi.cooling.classes.class_limit` [K].
     messages : int, optional
         Sent during the run.
+    flow : (n, N) array_like, optional
+        Facility water of each line [kg/s].
+    header : array_like, optional
+        Pressure across the primary circuits, 1 nominal; a number, (n,) or (n, N); 1 by default.
 
     Raises
     ------
@@ -126,7 +140,8 @@ def key_figures(
     supply = _series(supply, time, "supply")
     n, lines = supply.shape
     error = supply - _column(set_point, n, "set_point")
-    water = np.broadcast_to(_column(facility, n, "facility"), (n, 1))
+    water = _column(facility, n, "facility")
+    water = np.broadcast_to(water, (n, water.shape[1]))
     hours = (time[-1] - time[0]) / 3600
     squares = _mean(time, error**2)
     spread = np.ptp(supply, axis=1)
@@ -147,18 +162,29 @@ def key_figures(
         exceedance_band=float(beyond.sum()),
         exceedance_class=None
         if class_limit is None
-        else float(exceedance(time, water[:, 0], class_limit)),
+        else float(exceedance(time, water.max(axis=1), class_limit)),
         spread=float(spread.max()),
         spread_end=float(spread[end].mean()),
         settling=settling_time(time, np.abs(error).max(axis=1), BAND),
         strokes_per_hour=strokes,
         cycles_per_hour=cycles,
         hottest_case=hottest,
+        pump_energy=None
+        if flow is None
+        else _pump_energy(time, _series(flow, time, "flow", lines), header),
         messages_per_hour=None if messages is None else messages / hours,
         lowest=float((supply - water).min()),
+        lowest_supply=float(supply.min()),
         rms_by_line=np.sqrt(squares),
         worst_by_line=np.abs(error).max(axis=0),
     )
+
+
+def _pump_energy(time: Array, flow: Array, header: ArrayLike | None) -> float:
+    """Pressure times volume flow, over lines and time [J]."""
+    relative = _column(1.0 if header is None else header, len(time), "header")
+    power = NOMINAL_PRESSURE * relative * flow / WATER_DENSITY
+    return float(_mean(time, power).sum() * (time[-1] - time[0]))
 
 
 def settling_time(time: ArrayLike, deviation: ArrayLike, band: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import attrs
 import numpy as np
@@ -145,6 +146,14 @@ def sector(
     """
     if not 0 <= theta_r[0] <= theta_r[1] < math.inf:
         raise InputError(f"expected 0 <= low <= high (got {theta_r})", "theta_r")
+    least, most = _secants(line, opening)
+    gain = valve_mapping(line, opening).gain
+    return gain * theta_r[0] * least, gain * theta_r[1] * most
+
+
+@cache
+def _secants(line: LineParameters, opening: tuple[float, float]) -> tuple[float, float]:
+    """Least and largest ``(κ(y) - κ(y0))/(y - y0)`` over valve positions [W/K]."""
     valve = valve_mapping(line, opening)
     y, y0 = symbol("y"), sympy.Rational(repr(valve.y0))
     kappa = parse(_kappa_text(line, "y"), ["y"])
@@ -154,8 +163,7 @@ def sector(
     for a, b in ((low, valve.y0 - _NEAR), (valve.y0 + _NEAR, high)):
         if a < b:
             pieces.append(bounds(secant, {"y": (a, b)}))
-    least, most = min(p.low for p in pieces), max(p.high for p in pieces)
-    return valve.gain * theta_r[0] * least, valve.gain * theta_r[1] * most
+    return min(p.low for p in pieces), max(p.high for p in pieces)
 
 
 def slope_sector(
@@ -234,12 +242,9 @@ def line_agent(
     low, high = sector(line, theta_r, opening)
     own_low, own_high = sector(line, (line.theta_r0, line.theta_r0), opening)
     valve = valve_mapping(line, opening)
-    position = f"clip({valve.y0!r} - {valve.gain!r}*u1, {opening[0]!r}, {opening[1]!r})"
-    nominal = _kappa_text(line, repr(valve.y0))  # as text, so that sec(0) = 0 exactly
-    sec = f"({nominal} - {_kappa_text(line, position)})*{line.theta_r0!r}"
+    g, sec = line_texts(line, opening)
     # H carries kl P0/Cp, so that g has slope P/P0 in θp; P0/kl - θp0 is the load without leakage
     weight = line.kl * line.P0 / line.Cp
-    g = f"x1 + {1 / line.kl - line.theta_p0!r}" if line.kl > 0 else "1"
     return Agent(
         A=line.A(line.kappa0),
         H=np.diag([weight if line.kl > 0 else line.P0 / line.Cp, 0.0, 0.0]),
@@ -251,6 +256,15 @@ def line_agent(
         lipschitz=[max(1.0, loads[1] / line.P0), 0.0, 0.0] if line.kl > 0 else None,
         region={"u1": valve.inputs},
     )
+
+
+def line_texts(line: LineParameters, opening: tuple[float, float] = (0.0, 1.0)) -> tuple[str, str]:
+    """Return g₁ and sec of `line_agent` as text, in the language of expressions."""
+    valve = valve_mapping(line, opening)
+    position = f"clip({valve.y0!r} - {valve.gain!r}*u1, {opening[0]!r}, {opening[1]!r})"
+    nominal = _kappa_text(line, repr(valve.y0))  # as text, so that sec(0) = 0 exactly
+    sec = f"({nominal} - {_kappa_text(line, position)})*{line.theta_r0!r}"
+    return (f"x1 + {1 / line.kl - line.theta_p0!r}" if line.kl > 0 else "1"), sec
 
 
 def _kappa_text(line: LineParameters, y: str) -> str:

@@ -26,8 +26,11 @@ from posmas_fmi.scenario.signals import Columns, Signal, Signals, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
     ChannelTable,
+    CompareTable,
     ComponentTable,
     ConnectionTable,
+    ControlTable,
+    CoolingTable,
     Count,
     FaultTable,
     JumpTable,
@@ -64,6 +67,11 @@ class Scenario:
     s0 : (m,) array
     baseline : bool
         Whether the run without control is made as well.
+    control : ControlTable
+    controllers : dict of str to ControlTable
+        By the names that `compare` may use.
+    compare : CompareTable or None
+    cooling : CoolingTable or None
     components : tuple of ComponentTable
     connections : tuple of ConnectionTable
     faults : tuple of FaultTable
@@ -95,6 +103,10 @@ class Scenario:
     xhat0: Array
     s0: Array
     baseline: bool
+    control: ControlTable
+    controllers: dict[str, ControlTable]
+    compare: CompareTable | None
+    cooling: CoolingTable | None
     components: tuple[ComponentTable, ...]
     connections: tuple[ConnectionTable, ...]
     faults: tuple[FaultTable, ...]
@@ -168,10 +180,9 @@ def load(
     2
     """
     path = find(name_or_path)
-    tables, text = read_tables(path)
     given: dict[str, Any] = {"period": period, "until": until, "seed": seed}
-    head = attrs.evolve(tables.scenario, **{k: v for k, v in given.items() if v is not None})
-    return _Builder(attrs.evolve(tables, scenario=head), path, text).build()
+    tables, text = read_tables(path, {k: v for k, v in given.items() if v is not None})
+    return _Builder(tables, path, text).build()
 
 
 class _Builder:
@@ -218,10 +229,12 @@ class _Builder:
         self.check_components(network)
         made: dict[str, Signal] = {}
         if network and clock:
-            agents = network.N
+            agents, head = network.N, tables.scenario
             for name, table in tables.signals.items():
                 signal = self.attempt(
-                    lambda n=name, t=table: read_signal(n, t, agents, self.path.parent)  # type: ignore[misc]
+                    lambda n=name, t=table: read_signal(  # type: ignore[misc]
+                        n, t, agents, self.path.parent, head.until, head.period, head.seed
+                    )
                 )
                 if signal is not None:
                     made[name] = signal
@@ -249,6 +262,10 @@ class _Builder:
             xhat0=xhat0,
             s0=s0,
             baseline=tables.report.baseline,
+            control=tables.control,
+            controllers=tables.controllers,
+            compare=tables.compare,
+            cooling=tables.cooling,
             components=tuple(tables.component),
             connections=tuple(tables.connection),
             faults=tuple(tables.fault),
@@ -383,17 +400,26 @@ def make_network(table: NetworkTable, folder: Path) -> Network:
     InputError
     """
     pinned = table.pinned if isinstance(table.pinned, list) else []
-    if (table.arcs is None) == (table.file is None):
-        raise InputError("expected either arcs (with agents) or file", "$.network")
-    if table.arcs is not None:
+    if sum(given is not None for given in (table.arcs, table.file, table.ring)) != 1:
+        raise InputError("expected either arcs or ring (with agents), or file", "$.network")
+    if table.pin_weight <= 0 or (table.pin_weight != 1 and pins_open(table)):
+        raise InputError(
+            f"expected a number > 0, and 1 where the design chooses the pins "
+            f"(got {table.pin_weight:g})",
+            "$.network.pin_weight",
+        )
+    if table.file is None:
         if table.agents is None:
             raise InputError("this key is missing: how many agents there are", "$.network.agents")
-        network = network_from_arcs(table.agents, table.arcs, pinned, table.names)
+        arcs = _ring(table.agents, table.ring) if table.ring is not None else table.arcs or []
+        network = network_from_arcs(table.agents, arcs, pinned, table.names)
     else:
         adjacency, names = read_adjacency(folder / str(table.file))
         _check_pins(pinned, adjacency.shape[0])
         weights = np.bincount([k - 1 for k in pinned], minlength=adjacency.shape[0]).clip(max=1)
         network = Network(sp.csr_array(adjacency), weights, tuple(table.names) or names)
+    if table.pin_weight != 1:
+        network = attrs.evolve(network, pinning=table.pin_weight * network.pinning)
     if len(set(network.names)) < network.N:
         raise InputError("expected a different name for each agent", "$.network.names")
     if isinstance(table.pinned, Count) and not 1 <= table.pinned.count <= network.N:
@@ -408,6 +434,17 @@ def make_network(table: NetworkTable, folder: Path) -> Network:
             )
         network.require_reached()
     return network
+
+
+def _ring(agents: int, hops: list[int]) -> list[list[float]]:
+    """Arcs of a ring in which agent i hears i - k for each of the hops k."""
+    for k, hop in enumerate(hops):
+        if not 1 <= hop < agents or hop in hops[:k]:
+            raise InputError(
+                f"expected different numbers from 1 to {agents - 1} (got {hop})",
+                f"$.network.ring[{k}]",
+            )
+    return [[(i - hop) % agents + 1, i + 1] for hop in hops for i in range(agents)]
 
 
 def _check_pins(pinned: list[int], agents: int) -> None:

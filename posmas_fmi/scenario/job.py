@@ -16,8 +16,9 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.conditions import Sensors
 from posmas_fmi.cosim.fmu_plant import FmuPlant
-from posmas_fmi.cosim.law import ProtocolLaw
+from posmas_fmi.cosim.law import Law, ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, Outcome, Progress, System
 from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
@@ -57,8 +58,11 @@ class RunResult:
 
     @property
     def good(self) -> bool:
-        """Whether the run converged, stayed non-negative and is certified."""
-        return self.summary["verdict"] == "converged" and self.design.certificate.certified != "no"
+        """Whether the run converged (or all of a comparison ended) and is certified."""
+        return (
+            self.summary["verdict"] in ("converged", "compared")
+            and self.design.certificate.certified != "no"
+        )
 
 
 def make_design_of(scenario: Scenario) -> Design:
@@ -122,24 +126,45 @@ def run(
         If nothing could be run. A run that diverges or whose FMU fails is no error but a verdict,
         and what was recorded is kept.
     """
+    if scenario.compare is not None:
+        from posmas_fmi.scenario.compare import run_comparison
+
+        return run_comparison(scenario, folder, progress, command, report)
+    make_instances(scenario, fmu_files(scenario), extras(scenario))  # its mistakes come first
+    return run_designed(scenario, make_design_of(scenario), folder, progress, command, report)
+
+
+def run_designed(
+    scenario: Scenario,
+    designed: Design,
+    folder: Path,
+    progress: Callable[[str], Progress | None] = lambda label: None,
+    command: str = "",
+    report: bool = True,
+) -> RunResult:
+    """Run a scenario with a design that is there already; see `run`."""
     from posmas_fmi.report import write_report
 
+    designed = attrs.evolve(designed, network=law_network(scenario, designed))
     files = fmu_files(scenario)
-    instances = make_instances(scenario, files)
-    designed = make_design_of(scenario)
+    instances = make_instances(scenario, files, extras(scenario))
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
-    _make_folder(folder)
+    make_folder(folder)
     for name in ("summary.json", "report.html"):
         (folder / name).unlink(missing_ok=True)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
-    _write_json(folder / "design.json", facts)
+    if scenario.cooling is not None:
+        from posmas_fmi.scenario.cooling import proved
+
+        facts |= proved(scenario.control)
+    write_json(folder / "design.json", facts)
     told = manifest(scenario, files, choice, command)
-    _write_json(folder / "manifest.json", told)
+    write_json(folder / "manifest.json", told)
 
     def started(plant: FmuPlant) -> None:
         told["start_values"] = grouped(plant.start_values)
-        _write_json(folder / "manifest.json", told)
+        write_json(folder / "manifest.json", told)
 
     began = time.perf_counter()
     outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress, started)
@@ -161,8 +186,12 @@ def run(
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
         keys = ("verdict", "tracking_error_final", "min_state")
         summary["baseline"] = {key: without[key] for key in keys}
+    if scenario.cooling is not None:
+        from posmas_fmi.scenario.cooling import judge
+
+        judge(scenario, designed, outcome, folder / "results.nc", summary)
     summary["wall_s"] = round(time.perf_counter() - began, 3)
-    _write_json(folder / "summary.json", summary)
+    write_json(folder / "summary.json", summary)
     if report:
         write_report(folder)
     return RunResult(folder, designed, summary)
@@ -185,10 +214,10 @@ def _simulate(
     ):
         started(plant)
         system = make_system(scenario, designed, instances)
-        split = instances.recorded
+        split, more = instances.recorded, _more(scenario, system.law)
 
         def record(times: Array, values: dict[str, Array]) -> None:
-            recorder.record_block(times, split.named(values))
+            recorder.record_block(times, split.named(values) | more(times))
 
         outcome = engine.run(
             system,
@@ -238,24 +267,72 @@ def _without_control(
         )
 
 
+def make_law(scenario: Scenario, designed: Design) -> Law:
+    """Return the controllers of the agents, as ``[control]`` says.
+
+    Raises
+    ------
+    InputError
+        If the law or a parameter is not known.
+    """
+    if scenario.cooling is not None and scenario.control.law != "protocol":
+        from posmas_fmi.scenario.cooling import cooling_law
+
+        return cooling_law(scenario.control, scenario.cooling, designed)
+    if scenario.control.law != "protocol" or scenario.control.parameters:
+        raise InputError(
+            f'expected "protocol", without parameters (got {scenario.control.law!r}); other laws '
+            "need the table [cooling]",
+            "$.control",
+        )
+    return ProtocolLaw(
+        scenario.agent,
+        make_protocol(
+            designed.network,
+            designed.K,
+            designed.E,
+            designed.phi,
+            designed.mu,
+            designed.observer,
+            designed.protocol,
+        ),
+    )
+
+
+def extras(scenario: Scenario) -> tuple[str, ...]:
+    """Return what the law measures beside y."""
+    if scenario.cooling is None or scenario.control.law == "protocol":
+        return ()
+    from posmas_fmi.cooling.control import EXTRAS
+
+    return EXTRAS
+
+
+def law_network(scenario: Scenario, designed: Design) -> Network:
+    """Return the digraph over which the law's messages go."""
+    if scenario.cooling is None:
+        return designed.network
+    from posmas_fmi.scenario.cooling import network_of
+
+    return network_of(scenario.control, designed.network)
+
+
+def _more(scenario: Scenario, law: Law) -> Callable[[Array], dict[str, Array]]:
+    """Return what is recorded besides, as a function of times."""
+    if scenario.cooling is None:
+        return lambda times: {}
+    from posmas_fmi.scenario.cooling import set_points
+
+    return set_points(scenario.cooling, law)
+
+
 def make_system(scenario: Scenario, designed: Design, instances: Instances) -> System:
     """Put the definition of the co-simulation together."""
-    network = designed.network
+    network, law = designed.network, make_law(scenario, designed)
     return System(
         agent=scenario.agent,
         network=network,
-        law=ProtocolLaw(
-            scenario.agent,
-            make_protocol(
-                network,
-                designed.K,
-                designed.E,
-                designed.phi,
-                designed.mu,
-                designed.observer,
-                designed.protocol,
-            ),
-        ),
+        law=law,
         channel=make_channel(scenario.channel, network, scenario.clock.h),
         clock=scenario.clock,
         xhat0=scenario.xhat0,
@@ -264,7 +341,7 @@ def make_system(scenario: Scenario, designed: Design, instances: Instances) -> S
         wiring=instances.wiring,
         episodes=make_episodes(list(scenario.faults), network, scenario.agent, scenario.clock),
         leader_changes=scenario.jumps,
-        sensors=scenario.sensors,
+        sensors=_sensors(scenario.sensors, len(law.extras)),
         every=instances.every,
         **_coupling(scenario),
     )
@@ -281,6 +358,14 @@ def _coupling(scenario: Scenario) -> dict[str, Any]:
     return {}
 
 
+def _sensors(of_outputs: Sensors | None, extras: int) -> Sensors | None:
+    """Add sensors of what is measured beside y: exact ones."""
+    if of_outputs is None:
+        return None
+    exact = ((0, 0), (0, extras))
+    return Sensors(np.pad(of_outputs.noise, exact), np.pad(of_outputs.resolution, exact))
+
+
 def _recorder(
     scenario: Scenario,
     network: Network,
@@ -295,7 +380,7 @@ def _recorder(
         inputs=tuple(f"u{k + 1}" for k in range(agent.p)),
         outputs=tuple(f"y{k + 1}" for k in range(agent.q)),
         of_agents=tuple(recorded.of_agents),
-        of_run=tuple(recorded.of_components),
+        of_run=(*recorded.of_components, *(("set_point",) if scenario.cooling else ())),
     )
     attributes = {
         "scenario": scenario.name,
@@ -330,7 +415,14 @@ def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make the folder of a run.
+
+    Raises
+    ------
+    InputError
+        If that is not possible.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -340,5 +432,6 @@ def _make_folder(folder: Path) -> None:
         ) from None
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file; NaN is refused."""
     path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -105,7 +105,9 @@ class Instances:
         return FmuPlant(self.specs, self.shows_states, self.stop)
 
 
-def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
+def make_instances(
+    scenario: Scenario, files: list[Path], extras: tuple[str, ...] = ()
+) -> Instances:
     """Put ports, values and wiring of all instances together.
 
     Parameters
@@ -113,6 +115,8 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
     scenario : Scenario
     files : list of Path
         From `fmu_files`.
+    extras : tuple of str
+        What the law measures beside y.
 
     Raises
     ------
@@ -140,6 +144,7 @@ def make_instances(scenario: Scenario, files: list[Path]) -> Instances:
         wires.exogenous(N + k, table.exogenous, f"$.component[{k}].exogenous")
     for k, connection in enumerate(scenario.connections):
         wires.connect(connection, f"$.connection[{k}]")
+    wires.measure(_measured(scenario, extras), "$.plant.measured")
     wiring, recorded = wires.wiring(
         plant.record, [c.record for c in scenario.components], scenario.signals
     )
@@ -201,6 +206,25 @@ def _check_periods(scenario: Scenario, abouts: list[About], every: Whole) -> Non
             problems.append(("$.scenario.period", text))
     if problems:
         raise ScenarioError(tuple(problems), str(scenario.path))
+
+
+def _measured(scenario: Scenario, extras: tuple[str, ...]) -> dict[str, str]:
+    """Return the sources of what the law measures, in its order."""
+    given = scenario.plant.measured
+    problems = [
+        (f"$.plant.measured.{name}", "this key is missing: the control law measures it")
+        for name in extras
+        if name not in given
+    ]
+    words = ", ".join(extras) or "nothing beside y"
+    problems += [
+        (f"$.plant.measured.{name}", f"the control law measures {words}")
+        for name in given
+        if name not in extras
+    ]
+    if problems:
+        raise ScenarioError(tuple(problems), str(scenario.path))
+    return {name: given[name] for name in extras}
 
 
 def _values(scenario: Scenario, k: int) -> dict[str, Any]:

@@ -21,18 +21,29 @@ from cattrs.errors import (
 )
 
 from posmas_fmi.design import DesignSettings
-from posmas_fmi.errors import InputError, ScenarioError
-from posmas_fmi.scenario.tables import Count, Port, ScenarioFile, Uniform
+from posmas_fmi.errors import InputError, PosmasError, ScenarioError
+from posmas_fmi.scenario.tables import (
+    CoolingTable,
+    Count,
+    NetworkTable,
+    Port,
+    ScenarioFile,
+    ScenarioTable,
+    SignalTable,
+    Uniform,
+)
 
 LARGEST_FILE = 50_000_000  # bytes
 
 
-def read_tables(path: Path) -> tuple[ScenarioFile, str]:
+def read_tables(path: Path, instead: dict[str, Any] | None = None) -> tuple[ScenarioFile, str]:
     """Read a scenario file.
 
     Parameters
     ----------
     path : Path
+    instead : dict, optional
+        Values of ``[scenario]`` that take the place of the file's.
 
     Returns
     -------
@@ -58,14 +69,69 @@ def read_tables(path: Path) -> tuple[ScenarioFile, str]:
         raise InputError(
             "the file is empty; start from a shipped scenario, see 'posmas-fmi models'", str(path)
         )
+    head = document.get("scenario")
+    if isinstance(head, dict):
+        head |= instead or {}
+    converter = _converter()
+    if "cooling" in document:
+        document = _expand(document, converter, path)
     problems = _design_problems(document.get("design"))
     try:
-        tables = _converter().structure(document, ScenarioFile)
+        tables = converter.structure(document, ScenarioFile)
     except (ClassValidationError, IterableValidationError) as error:
         problems = [*_problems(error, "$"), *problems]
     if problems:
         raise ScenarioError(tuple(problems), str(path))
     return tables, text
+
+
+def _expand(document: dict[str, Any], converter: cattrs.Converter, path: Path) -> dict[str, Any]:
+    """Put the tables that ``[cooling]`` stands for beside those that are written."""
+    from posmas_fmi.scenario.cooling import expand
+
+    parts: dict[str, Any] = {}
+    problems: list[tuple[str, str]] = []
+    for name, kind in (
+        ("cooling", CoolingTable),
+        ("network", NetworkTable),
+        ("scenario", ScenarioTable),
+        ("signals", dict[str, SignalTable]),
+    ):
+        try:
+            parts[name] = converter.structure(document.get(name, {}), kind)
+        except (ClassValidationError, IterableValidationError) as error:
+            problems += _problems(error, f"$.{name}")
+    if problems:
+        raise ScenarioError(tuple(problems), str(path))
+    try:
+        more = expand(**parts, folder=path.parent)
+    except PosmasError as error:
+        raise ScenarioError(tuple(error.problems), str(path)) from None
+    return merged(more, document)
+
+
+def merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Lay tables over others: key by key, and lists of tables one after the other.
+
+    Examples
+    --------
+    >>> merged({"a": {"x": 1, "y": 2}, "b": [{}]}, {"a": {"y": 3}, "b": [{"z": 1}]})
+    {'a': {'x': 1, 'y': 3}, 'b': [{}, {'z': 1}]}
+    """
+    result = dict(tables)
+    for key, value in over.items():
+        below = result.get(key)
+        if isinstance(below, dict) and isinstance(value, dict):
+            result[key] = merged(below, value)
+        elif isinstance(below, list) and _tables(below) and _tables(value):
+            result[key] = [*below, *value]
+        else:
+            result[key] = value
+    return result
+
+
+def _tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
 
 
 def _design_problems(table: Any) -> list[tuple[str, str]]:
@@ -213,7 +279,10 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin in (list, tuple):
         if not isinstance(value, list):
             return False
-        nested = typing.get_origin(typing.get_args(kind)[0]) is list
+        part = typing.get_args(kind)[0]
+        if _is_union(part):
+            return True  # its elements choose for themselves
+        nested = typing.get_origin(part) is list
         return not value or nested == isinstance(value[0], list)
     if origin is dict or attrs.has(kind):
         return isinstance(value, dict)

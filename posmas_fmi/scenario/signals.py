@@ -11,7 +11,7 @@ import numpy as np
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.scenario.tables import SignalTable
+from posmas_fmi.scenario.tables import Generated, SignalTable
 
 LARGEST_FILE = 1_000_000_000  # bytes
 
@@ -89,7 +89,15 @@ class Signals:
         return np.concatenate([signal.at(times) for signal in self.signals], axis=1)
 
 
-def read_signal(name: str, table: SignalTable, agents: int, folder: Path) -> Signal:
+def read_signal(
+    name: str,
+    table: SignalTable,
+    agents: int,
+    folder: Path,
+    until: float = 0.0,
+    period: float = 1.0,
+    seed: int = 0,
+) -> Signal:
     """Make a signal of its table.
 
     Parameters
@@ -100,6 +108,9 @@ def read_signal(name: str, table: SignalTable, agents: int, folder: Path) -> Sig
         A signal has one column, or one for each agent.
     folder : Path
         Of the scenario.
+    until, period : float
+        Of the scenario [s], for loads that are generated.
+    seed : int
 
     Raises
     ------
@@ -107,8 +118,17 @@ def read_signal(name: str, table: SignalTable, agents: int, folder: Path) -> Sig
         If the file cannot be read, has gaps or times that do not increase, or lacks columns.
     """
     place = f"$.signals.{name}"
-    if (table.value is None) == (table.file is None):
-        raise InputError("expected either value or file", place)
+    given = [k for k in ("value", "values", "generated", "file") if getattr(table, k) is not None]
+    if len(given) != 1:
+        raise InputError(
+            "expected one of value, values (with times), generated and file "
+            f"(got {' and '.join(given) or 'none'})",
+            place,
+        )
+    if table.generated is not None:
+        return _scaled(_generate(table.generated, agents, until, period, seed), table)
+    if table.values is not None:
+        return _scaled(_listed(table, agents, place), table)
     if table.value is not None:
         return Signal(np.zeros(1), np.full((1, 1), table.scale * table.value + table.offset))
     path = folder / str(table.file)
@@ -135,6 +155,43 @@ def read_signal(name: str, table: SignalTable, agents: int, folder: Path) -> Sig
         )
     values = rows[:, [header.index(column) for column in wanted]]
     return Signal(time, table.scale * values + table.offset, table.interpolation == "linear")
+
+
+def _scaled(signal: Signal, table: SignalTable) -> Signal:
+    values = table.scale * signal.values + table.offset
+    return Signal(signal.time, values, table.interpolation == "linear")
+
+
+def _listed(table: SignalTable, agents: int, place: str) -> Signal:
+    """Read a signal that stands in the scenario itself."""
+    times, rows = table.times or [], table.values or []
+    if len(times) != len(rows) or not rows:
+        raise InputError(f"expected a time for each value (got {len(times)}, {len(rows)})", place)
+    whole = [row if isinstance(row, list) else [row] for row in rows]
+    columns = max(map(len, whole))
+    for k, row in enumerate(whole):
+        if len(row) not in (1, columns) or columns not in (1, agents):
+            raise InputError(
+                f"expected one value or {agents}, one for each agent (got {len(row)})",
+                f"{place}.values[{k}]",
+            )
+    if (np.diff(times) <= 0).any():
+        raise InputError("expected increasing times", f"{place}.times")
+    return Signal(np.array(times), np.array([np.broadcast_to(row, columns) for row in whole]))
+
+
+def _generate(table: Generated, agents: int, until: float, period: float, seed: int) -> Signal:
+    """Generate heat loads, one column for each agent."""
+    from posmas_fmi.cooling.loads import generate_loads, training_loads
+
+    seed = seed if table.seed is None else table.seed
+    if table.kind == "training":
+        step = period if table.step is None else table.step
+        loads = training_loads(agents, max(until, step), seed, table.maximum, step)
+    else:
+        step = 15.0 if table.step is None else table.step
+        loads = generate_loads(agents, max(until, step), seed, table.maximum, step)
+    return Signal(loads.time, loads.power)
 
 
 def _read(path: Path, place: str) -> tuple[list[str], Array]:

@@ -87,7 +87,11 @@ class NetworkTable:
         Agents are numbered from 1; "to" hears "from".
     file : str, optional
         ``.csv``, ``.mtx`` or ``.graphml``, instead of `arcs`.
+    ring : list of int, optional
+        Instead of `arcs`: agent i hears the agents i - k of a ring, for each k listed.
     pinned : list of int, "auto" or {count = k}
+    pin_weight : float
+        Weight of the arcs from the leader.
     names : list of str, optional
     """
 
@@ -95,6 +99,8 @@ class NetworkTable:
     agents: int | None = None
     arcs: list[list[float]] | None = None
     file: str | None = None
+    ring: list[int] | None = None
+    pin_weight: float = 1.0
     names: list[str] = attrs.field(factory=list)
 
 
@@ -158,6 +164,9 @@ class PlantTable:
         Start values by name.
     exogenous : table
         FMU input = "name of a signal".
+    measured : table
+        What the controllers measure beside y, ``name = "signal"``, ``"VARIABLE"`` of the agent's
+        FMU or ``"component.VARIABLE"``; which names there are, the control law says.
     record : list of str
         FMU variables that are recorded besides.
     tolerance : float, optional
@@ -172,8 +181,31 @@ class PlantTable:
     parameters: dict[str, Any] = attrs.field(factory=dict)
     override: list[Override] = attrs.field(factory=list)
     exogenous: dict[str, str] = attrs.field(factory=dict)
+    measured: dict[str, str] = attrs.field(factory=dict)
     record: list[str] = attrs.field(factory=list)
     tolerance: float | None = None
+
+
+@attrs.frozen
+class Generated:
+    """``generated`` of a signal: heat loads of cooling lines from fitted statistics.
+
+    Attributes
+    ----------
+    kind : {"machine", "training"}
+        A large machine with many jobs (fitted to a day of Frontier), or training of one model.
+    maximum : float
+        Largest load of a line [W].
+    step : float, optional
+        Between the values [s]; default 15, and the period for training.
+    seed : int, optional
+        Default: that of the scenario.
+    """
+
+    kind: Literal["machine", "training"]
+    maximum: float = 130e3
+    step: float | None = None
+    seed: int | None = None
 
 
 @attrs.frozen
@@ -184,6 +216,10 @@ class SignalTable:
     ----------
     value : float, optional
         Constant, instead of `file`.
+    times, values : list, optional
+        Instead of `file`: times [s], and for each the value, or one value for each agent.
+    generated : table, optional
+        Instead of `file`: heat loads, see `Generated`.
     file : str, optional
         CSV with a header and the time [s] in its first column.
     columns : list of str
@@ -197,6 +233,9 @@ class SignalTable:
     """
 
     value: float | None = None
+    times: list[float] | None = None
+    values: list[float | list[float]] | None = None
+    generated: Generated | None = None
     file: str | None = None
     columns: list[str] = attrs.field(factory=list)
     scale: float = 1.0
@@ -246,14 +285,16 @@ class ConnectionTable:
         ``{agent}`` in a variable stands for the agent's number.
     sum : bool
         Whether an input is the sum over all agents.
-    scale, offset : float, optional
+    scale : float or list of float, optional
+        With `sum`, also one for each agent.
+    offset : float, optional
         Input = scale × source + offset. Where neither is given, units are converted or refused.
     """
 
     source: str
     to: str
     sum: bool = False
-    scale: float | None = None
+    scale: float | list[float] | None = None
     offset: float | None = None
 
 
@@ -387,6 +428,113 @@ class ChannelTable:
 
 
 @attrs.frozen
+class ControlTable:
+    """``[control]`` and ``[controllers.NAME]``: the law of the agents' controllers.
+
+    Attributes
+    ----------
+    law : str
+        ``protocol``: (6) with the gains of ``[design]``. With ``[cooling]``: one of
+        `posmas_fmi.cooling.CONTROLLERS`.
+    parameters : table
+        Of the law; for cooling those of `posmas_fmi.cooling.Control`.
+    """
+
+    law: str = "protocol"
+    parameters: dict[str, Any] = attrs.field(factory=dict)
+
+
+@attrs.frozen
+class CompareTable:
+    """``[compare]``: several controllers on the same plant, loads, faults and random numbers.
+
+    Attributes
+    ----------
+    controllers : list of str
+        Laws, or names of ``[controllers.NAME]``.
+    practice : str, optional
+        Which of them the others are judged against; default ``pi`` where it is among them.
+    processes : int, optional
+        How many run at once; default one per processor.
+    """
+
+    controllers: list[str]
+    practice: str | None = None
+    processes: int | None = None
+
+
+@attrs.frozen
+class SetPointStep:
+    """``set_point_step``: from a time `at` [s] on the set-point is `to` [K above the water]."""
+
+    at: float
+    to: float
+
+
+@attrs.frozen
+class Air:
+    """``air``: temperature [K] and relative humidity of the room, for the dew point."""
+
+    temperature: float
+    humidity: float
+
+
+@attrs.frozen
+class CoolingTable:
+    """``[cooling]``: a row of liquid-cooling lines on one facility header.
+
+    It stands for ``[agent]``, ``[plant]``, ``[leader]``, ``[initial]``, two components and their
+    connections; what a scenario says in those tables itself counts more.
+
+    Attributes
+    ----------
+    sizes : float or list of float
+        Nominal load of the lines, or of each [W].
+    load : str
+        Name of the signal with the IT power [W].
+    loads : (float, float)
+        Range of the loads that the design covers [W], of a line of 80 kW.
+    pump : str, optional
+        Name of the signal with the speed of the lines' pumps, 1 nominal.
+    shortage : float
+        Shared part of the resistance of the primary circuit over that of the lines; 0: ample water.
+    facility : float
+        Facility supply temperature at nominal heat [K].
+    wet_bulb : float or str
+        Outdoors [K], or the name of a signal.
+    chiller : float
+        Heat that a chiller can reject besides the cooler [W].
+    water_class : str, optional
+        W17, W27, W32, W40 or W45: the limit of the facility supply.
+    air : table, optional
+        Temperature and humidity of the room: supply stays 2 K above its dew point.
+    noise, resolution : float
+        Of the temperature sensors [K].
+    set_point : float, optional
+        Supply temperature above `facility` [K]; default 5.
+    set_point_step : table, optional
+    band : float
+        Around the set-point that is to be kept [K].
+    """
+
+    sizes: float | list[float] = 80e3
+    load: str = "load"
+    loads: tuple[float, float] = (40e3, 130e3)
+    pump: str | None = None
+    shortage: float = 0.0
+    facility: float = 305.15
+    wet_bulb: float | str = 293.15
+    chiller: float = 0.0
+    water_class: str | None = None
+    air: Air | None = None
+    noise: float = 0.05
+    resolution: float = 0.1
+    set_point: float | None = None
+    set_point_step: SetPointStep | None = None
+    band: float = 1.0
+
+
+@attrs.frozen
 class ReportTable:
     """``[report]``: whether the run without control is made as well, for comparison."""
 
@@ -411,3 +559,7 @@ class ScenarioFile:
     connection: list[ConnectionTable] = attrs.field(factory=list)
     fault: list[FaultTable] = attrs.field(factory=list)
     sensors: SensorTable = attrs.field(factory=SensorTable)
+    control: ControlTable = attrs.field(factory=ControlTable)
+    controllers: dict[str, ControlTable] = attrs.field(factory=dict)
+    compare: CompareTable | None = None
+    cooling: CoolingTable | None = None

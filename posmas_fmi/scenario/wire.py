@@ -120,6 +120,19 @@ def _placed(make: Callable[[], Conversion], place: str) -> Conversion:
         raise InputError(error.message, place) from None
 
 
+def _weights(table: ConnectionTable, sources: int, place: str) -> list[float]:
+    """Scale of each source of a connection."""
+    if not isinstance(table.scale, list):
+        return [1.0 if table.scale is None else table.scale] * sources
+    if len(table.scale) != sources or not table.sum:
+        raise InputError(
+            f"expected a number, or with sum = true {sources}, one for each agent "
+            f"(got {len(table.scale)})",
+            place,
+        )
+    return table.scale
+
+
 @attrs.frozen
 class _Reading:
     instance: int
@@ -147,6 +160,7 @@ class Wires:
         self._number = {one.name: k for k, one in enumerate(self._all)}
         self._terms: list[tuple[int, str, list[tuple[_Reading | int, float]], float, str]] = []
         self._units: dict[tuple[About, About, str, str], Conversion] = {}
+        self._measured: list[list[_Reading | int]] = []
 
     def exogenous(self, instance: int, inputs: Mapping[str, str], place: str) -> None:
         """Let inputs of an instance follow signals.
@@ -175,6 +189,37 @@ class Wires:
             unit = self._from_signal(found.unit, instance, variable, where)
             self._terms.append((instance, variable, [(source, unit.scale)], unit.offset, where))
 
+    def measure(self, sources: Mapping[str, str], place: str) -> None:
+        """Let every agent measure more than y: signals, readings of its FMU or of a component's.
+
+        Parameters
+        ----------
+        sources : mapping of str to str
+            By what the law calls it, in the order of the law.
+        place : str
+
+        Raises
+        ------
+        InputError
+            If it is not clear which component is meant.
+        """
+        for name, source in sources.items():
+            if source in self._columns:
+                found = self._columns[source]
+                ends: list[_Reading | int] = [
+                    column(found.first + (k if found.count > 1 else 0))
+                    for k in range(len(self._agents))
+                ]
+            elif source.partition(".")[0] in self._number:
+                (instance,), variable = self._end(source, f"{place}.{name}")
+                ends = [_Reading(instance, variable)] * len(self._agents)
+            else:
+                ends = [_Reading(k, source) for k in range(len(self._agents))]
+            for end in dict.fromkeys(ends):
+                if isinstance(end, _Reading):
+                    self._all[end.instance].check(end.variable, f"{place}.{name}")
+            self._measured.append(ends)
+
     def connect(self, table: ConnectionTable, place: str) -> None:
         """Let what some instances show be inputs of others.
 
@@ -189,12 +234,14 @@ class Wires:
         readings = [_Reading(k, text.replace("{agent}", str(k + 1))) for k in sources]
         for reading in readings:
             self._all[reading.instance].check(reading.variable, f"{place}.source")
+        weights = _weights(table, len(readings), f"{place}.scale")
+        own = dict(zip(readings, weights, strict=True))
 
         def add(target: int, variable: str, chosen: list[_Reading]) -> None:
             self._all[target].check(variable, f"{place}.to")
             bias, terms = 0.0 if table.offset is None else table.offset, []
             for reading in chosen:
-                weight = 1.0 if table.scale is None else table.scale
+                weight = own[reading]
                 if table.scale is None and table.offset is None:
                     unit = self._unit(reading, target, variable, place)
                     weight, bias = unit.scale, bias + unit.offset
@@ -280,6 +327,7 @@ class Wires:
             self._all[reading.instance].check(reading.variable, place_of)
         local: dict[_Reading, int] = {}
         in_terms = [s for _, _, terms, _, _ in self._terms for s, _ in terms]
+        in_terms += [source for ends in self._measured for source in ends]
         for reading in (*recorded, *(s for s in in_terms if isinstance(s, _Reading))):
             local[reading] = self._all[reading.instance].wants(reading.variable)
         widths = [len(one.readings.variables) + len(one.more) for one in self._all]
@@ -291,9 +339,10 @@ class Wires:
         for instance, variable, terms, bias, where in self._terms:
             extra = Extra(tuple(Term(place(s), w) for s, w in terms), bias)
             self._all[instance].feed(variable, extra, where)
+        measured = [[place(source) for source in ends] for ends in self._measured]
         wiring = Wiring(
             tuple(tuple(one.extras.values()) for one in self._all),
-            np.zeros((n, 0), dtype=np.int64),
+            np.array(measured, dtype=np.int64).reshape(len(measured), n).T,
             tuple(place(reading) for reading in recorded),
             NoDrive() if signals is None else signals,
         )

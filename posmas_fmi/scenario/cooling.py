@@ -1,0 +1,444 @@
+"""What ``[cooling]`` stands for: agent, FMUs, wiring, and the controllers of a row of lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.cooling.classes import class_limit, dew_point
+from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, Control, controller
+from posmas_fmi.cooling.figures import facts, kpi_table, limits, verdicts
+from posmas_fmi.cooling.kpi import key_figures
+from posmas_fmi.cooling.law import CoolingLaw, team_network
+from posmas_fmi.cooling.line import LineParameters
+from posmas_fmi.cooling.mapping import line_agent, line_texts, valve_mapping
+from posmas_fmi.cooling.plant import header_values, line_values
+from posmas_fmi.cosim.law import Law
+from posmas_fmi.cosim.master import Outcome
+from posmas_fmi.design import Design
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array
+from posmas_fmi.network import Network
+from posmas_fmi.scenario.signals import read_signal
+from posmas_fmi.scenario.tables import (
+    ControlTable,
+    CoolingTable,
+    NetworkTable,
+    ScenarioTable,
+    SignalTable,
+)
+
+if TYPE_CHECKING:
+    from posmas_fmi.scenario.build import Scenario
+
+NOMINAL = LineParameters()
+FACILITY = "facility"
+HELD_ABOVE_DEW_POINT = 2.0  # K
+RECORDED = (
+    "supply_temperature",
+    "return_temperature",
+    "case_temperature",
+    "valve_position",
+    "primary_flow",
+    "heat_load",
+    "header",
+    "facility_temperature",
+)
+# Integral time [s] of the integral law over its proportional part: stable with room to spare at
+# every period that a design certifies (benchmarks/cooling.py).
+INTEGRAL_TIME = 44.0
+
+
+def sizes(table: CoolingTable, lines: int) -> Array:
+    """Return the nominal load of each line over that of the nominal line, (N,).
+
+    Raises
+    ------
+    InputError
+        If there are not as many as lines, or one is not positive.
+    """
+    watts = np.atleast_1d(np.asarray(table.sizes, dtype=float))
+    if len(watts) not in (1, lines) or (watts <= 0).any():
+        raise InputError(
+            f"expected a load > 0 [W], or {lines}, one for each line (got {table.sizes})",
+            "$.cooling.sizes",
+        )
+    return np.broadcast_to(watts / NOMINAL.P0, (lines,))
+
+
+def expand(
+    cooling: CoolingTable,
+    network: NetworkTable,
+    scenario: ScenarioTable,
+    signals: Mapping[str, SignalTable],
+    folder: Path,
+) -> dict[str, Any]:
+    """Return the tables that ``[cooling]`` stands for, as TOML would give them.
+
+    Lines start in the steady state of their first load with the valve at its nominal position.
+
+    Parameters
+    ----------
+    cooling : CoolingTable
+    network : NetworkTable
+    scenario : ScenarioTable
+    signals : mapping of str to SignalTable
+        With the load.
+    folder : Path
+        Of the scenario.
+
+    Raises
+    ------
+    InputError
+        If sizes, loads or limits do not fit.
+    """
+    from posmas_fmi.scenario.build import make_network
+
+    n = make_network(network, folder).N
+    _check(cooling, signals)
+    line, size = NOMINAL, sizes(cooling, n)
+    load = read_signal(
+        cooling.load,
+        signals[cooling.load],
+        n,
+        folder,
+        scenario.until,
+        scenario.period,
+        scenario.seed,
+    )
+    first = np.broadcast_to(load.at(np.zeros(1))[0], (n,))
+    values = [
+        line_values(line.sized(float(s) * line.P0), float(p), facility=cooling.facility)
+        for s, p in zip(size, first, strict=True)
+    ]
+    common = values[0]
+    start = [[v["T_plate"], v["T_return"], v["T_supply"]] for v in values]
+    above = (np.array(start) - cooling.facility).tolist()
+    wet_bulb = cooling.wet_bulb
+    named = wet_bulb if isinstance(wet_bulb, str) else "wet_bulb"
+    return {
+        "scenario": {"tolerance": cooling.band},
+        "agent": _agent(cooling, line),
+        "plant": {
+            **_ports(cooling, line),
+            "parameters": common,
+            "override": [
+                {"agent": k + 1, "parameters": different}
+                for k, own in enumerate(values)
+                if (different := {name: v for name, v in own.items() if v != common[name]})
+            ],
+        },
+        "leader": {"s0": line.theta0.tolist()},
+        "initial": {"xhat": above},
+        "signals": {} if isinstance(wet_bulb, str) else {named: {"value": wet_bulb}},
+        "component": [_facility(cooling, line, size, float(first.sum()), named)],
+        "connection": _connections(size),
+        "control": {"law": "integral_ff"},
+        "sensors": {"noise": cooling.noise, "resolution": cooling.resolution},
+        "report": {"baseline": False},
+    }
+
+
+def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
+    for key in ("load", "pump", "wet_bulb"):
+        name = getattr(cooling, key)
+        if isinstance(name, str) and name not in signals:
+            raise InputError(
+                f"there is no signal {name!r}: write [signals.{name}]", f"$.cooling.{key}"
+            )
+    if cooling.water_class is not None:
+        class_limit(cooling.water_class)
+    if cooling.band <= 0:
+        raise InputError(f"expected a number > 0 (got {cooling.band:g})", "$.cooling.band")
+    for key in ("noise", "resolution", "shortage", "chiller"):
+        if getattr(cooling, key) < 0:
+            raise InputError(
+                f"expected a number >= 0 (got {getattr(cooling, key):g})", f"$.cooling.{key}"
+            )
+
+
+def _agent(cooling: CoolingTable, line: LineParameters) -> dict[str, Any]:
+    agent = line_agent(line, cooling.loads)
+    g, sec = line_texts(line)
+    return {
+        **{name: getattr(agent, name).tolist() for name in "ABCH"},
+        "g": [g, "0", "0"],
+        "sec": [sec],
+        "sector": list(agent.sector),
+        "lipschitz": np.asarray(agent.lipschitz).tolist(),
+        "region": {name: list(limits) for name, limits in agent.region.items()},
+    }
+
+
+def _ports(cooling: CoolingTable, line: LineParameters) -> dict[str, Any]:
+    valve = valve_mapping(line)
+    pump = {} if cooling.pump is None else {"pump": cooling.pump}
+    temperatures = ("return_temperature", "supply_temperature")
+    return {
+        "fmu": "cooling_line",
+        "inputs": {"u1": {"variable": "valve", "scale": -valve.gain, "offset": valve.y0}},
+        "outputs": {
+            f"y{k + 1}": {"variable": name, "offset": cooling.facility, "unit": "K"}
+            for k, name in enumerate(temperatures)
+        },
+        "exogenous": {"heat_load": cooling.load, **pump},
+        "measured": {
+            "power": cooling.load,
+            "valve": "valve_position",
+            "water": f"{FACILITY}.facility_temperature",
+        },
+        "record": list(RECORDED),
+    }
+
+
+def _facility(
+    cooling: CoolingTable, line: LineParameters, size: Array, heat: float, wet_bulb: str
+) -> dict[str, Any]:
+    values: dict[str, Any] = header_values(line, 1, cooling.shortage, facility=cooling.facility)
+    for name in ("kv_nominal", "capacity", "control", "cooler"):
+        values[name] *= float(size.sum())
+    values |= {
+        "heat": heat,
+        "kv": [0.0] * 64,
+        "kv_others": values["kv_nominal"],
+        "chiller": cooling.chiller,
+    }
+    return {
+        "name": FACILITY,
+        "fmu": "facility_header",
+        "parameters": values,
+        "exogenous": {"wet_bulb": wet_bulb},
+    }
+
+
+def _connections(size: Array) -> list[dict[str, Any]]:
+    alike = bool((size == size[0]).all())
+    return [
+        {"source": f"{FACILITY}.header", "to": "agents.header"},
+        {
+            "source": f"{FACILITY}.facility_temperature",
+            "to": "agents.facility_temperature",
+        },
+        {
+            "source": "agents.kv",
+            "to": f"{FACILITY}.kv_others",
+            "sum": True,
+            "scale": float(size[0]) if alike else size.tolist(),
+        },
+        {"source": "agents.primary_heat_flow", "to": f"{FACILITY}.heat", "sum": True},
+    ]
+
+
+# ---- controllers --------------------------------------------------------------------------------
+
+
+def control(table: ControlTable, cooling: CoolingTable, designed: Design, place: str) -> Control:
+    """Return the controllers of the lines: named law, gains of the design, parameters on top.
+
+    Raises
+    ------
+    InputError
+        If law or a parameter is not known, or out of range.
+    """
+    changes: dict[str, Any] = {
+        "K": designed.phi * designed.K[0],
+        "K_q": designed.phi * float(designed.K[0].sum()) / INTEGRAL_TIME,
+        "E": designed.E,
+        "set_point": cooling.set_point,
+        "floor": floor(cooling),
+    }
+    if cooling.set_point_step is not None:
+        step = cooling.set_point_step
+        changes |= {"set_point_at": step.at, "set_point_after": step.to}
+    known = [a.name for a in attrs.fields(Control) if a.name not in ("law", "sign")]
+    for name in table.parameters:
+        if name not in known:
+            raise InputError(
+                f"unknown key; known keys: {', '.join(known)}", f"{place}.parameters.{name}"
+            )
+    if table.law not in CONTROLLERS:
+        raise InputError(
+            f"expected one of {', '.join(CONTROLLERS)} (got {table.law!r})", f"{place}.law"
+        )
+    try:
+        return controller(table.law, **changes | table.parameters)
+    except (TypeError, ValueError) as error:
+        raise InputError(str(error), f"{place}.parameters") from None
+    except InputError as error:
+        raise InputError(error.message, f"{place}.parameters.{error.where}") from None
+
+
+def floor(cooling: CoolingTable) -> float | None:
+    """Return the least supply temperature [K]; None where the air is not stated."""
+    if cooling.air is None:
+        return None
+    dew = float(dew_point(cooling.air.temperature, cooling.air.humidity))
+    return dew + HELD_ABOVE_DEW_POINT
+
+
+def network_of(table: ControlTable, network: Network) -> Network:
+    """Return the digraph that a law's messages go over."""
+    if table.law != "team":
+        return network
+    return attrs.evolve(team_network(network.N), names=network.names)
+
+
+def cooling_law(
+    table: ControlTable, cooling: CoolingTable, designed: Design, place: str = "$.control"
+) -> CoolingLaw:
+    """Return the law of ``[control]`` or ``[controllers.NAME]``.
+
+    Parameters
+    ----------
+    table : ControlTable
+    cooling : CoolingTable
+    designed : Design
+    place : str
+        Of the table in the scenario.
+
+    Raises
+    ------
+    InputError
+        If law or a parameter is not known, or out of range.
+    """
+    network = designed.network
+    return CoolingLaw(
+        NOMINAL,
+        control(table, cooling, designed, place),
+        network_of(table, network),
+        sizes(cooling, network.N),
+        water=cooling.facility,
+    )
+
+
+def proved(table: ControlTable) -> dict[str, Any]:
+    """Return what design.json says instead of the design where a law is not the protocol (6).
+
+    The certificate of the design is about (6) with its gains, which only the proportional law is.
+    """
+    note = WHAT_IS_PROVED.get(table.law, "")
+    if table.law in ("protocol", "proportional"):
+        return {"notes": [note]} if note else {}
+    return {
+        "certified": "no",
+        "conditions": [],
+        "covers": [],
+        "rate": None,
+        "observer_rate": None,
+        "rate_perron": None,
+        "positive": False,
+        "notes": [f"The gains are those of the design; the law is {table.law!r}. {note}"],
+    }
+
+
+# ---- what came of it ----------------------------------------------------------------------------
+
+
+def set_points(cooling: CoolingTable, law: Law) -> Callable[[Array], dict[str, Array]]:
+    """Return what gives the set-point [K] at some times, as a recorded variable."""
+    own = law if isinstance(law, CoolingLaw) else None
+
+    def at(times: Array) -> dict[str, Array]:
+        above = [NOMINAL.theta_s0 if own is None else own.set_point(t) for t in times]
+        return {"set_point": cooling.facility + np.array(above)}
+
+    return at
+
+
+def judge(
+    scenario: Scenario, designed: Design, outcome: Outcome, results: Path, summary: dict[str, Any]
+) -> None:
+    """Add key figures and limits to a summary, and let its verdict be about temperatures.
+
+    A line has converged if its supply is within the tolerance of the set-point in the mean over the
+    last tenth of the run. (The leader is the nominal line at the nominal load: lines with other
+    loads have other states.)
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With ``[cooling]``.
+    designed : Design
+    outcome : Outcome
+    results : Path
+        results.nc of the run.
+    summary : dict
+        Changed in place.
+    """
+    cooling, name = scenario.cooling, scenario.control.law
+    assert cooling is not None
+    wanted = limits(cooling.band, cooling.water_class, floor(cooling))
+    summary |= {
+        "kpi": kpi_table(),
+        "practice": None,
+        "limits": [attrs.asdict(limit) for limit in wanted],
+        "facility_K": cooling.facility,
+        "band_K": cooling.band,
+        "scenario": scenario.name,
+        "created_by": f"posmas-fmi {metadata.version('posmas-fmi')}",
+    }
+    table = _recorded(results)
+    if len(table["time"]) < 2:
+        return
+    alone = name in CONTROLLERS and CONTROLLERS[name].law in ("fixed", "local")
+    if name not in ("protocol", "proportional"):
+        for row in summary.get("coverage", []):
+            row |= {"covered": False, "why": "the certificate is about the protocol (6)"}
+    figures = key_figures(
+        table["time"],
+        table["supply_temperature"],
+        table["set_point"],
+        table["facility_temperature"],
+        table["valve_position"],
+        table["case_temperature"],
+        None if cooling.water_class is None else class_limit(cooling.water_class),
+        0 if alone else outcome.messages,
+        table["primary_flow"],
+        table["header"],
+    )
+    found = facts(figures)
+    found["limits"] = verdicts(found, wanted)
+    found["proved"] = WHAT_IS_PROVED.get(name, "")
+    deviation = table["supply_temperature"] - table["set_point"][:, None]
+    lowest = table["supply_temperature"] - table["facility_temperature"]
+    end = table["time"] >= table["time"][-1] - 0.1 * (table["time"][-1] - table["time"][0])
+    final = np.abs(deviation[end].mean(axis=0))
+    for k, agent in enumerate(summary["agents"]):
+        agent["final_error"] = float(final[k])
+        agent["min_state"] = float(lowest[:, k].min())
+        agent["min_time"] = float(table["time"][lowest[:, k].argmin()])
+        agent["non_negative"] = agent["min_state"] >= 0
+        agent["converged"] = agent["final_error"] <= scenario.settings.tolerance
+        if agent["status"] in ("converged", "not converged", "positivity lost"):
+            agent["status"] = _status(agent)
+    statuses = [agent["status"] for agent in summary["agents"]]
+    if outcome.ended == "complete":
+        order = ("positivity lost", "not converged")
+        summary["verdict"] = next((s for s in order if s in statuses), "converged")
+    summary |= {
+        "tracking_error_final": float(final.max()),
+        "min_state": figures.lowest,
+        "comparison": {name: found},
+    }
+
+
+def _status(agent: Mapping[str, Any]) -> str:
+    if not agent["non_negative"]:
+        return "positivity lost"
+    return "converged" if agent["converged"] else "not converged"
+
+
+def _recorded(path: Path) -> dict[str, Array]:
+    """Read what was recorded of a run, as far as it went."""
+    import h5py
+
+    wanted = ("time", "set_point", *RECORDED)
+    with h5py.File(path, "r") as file:
+        table = {name: np.asarray(file[name]) for name in wanted}
+    rows = np.isfinite(table["time"]) & np.isfinite(table["supply_temperature"]).all(axis=1)
+    return {name: values[rows] for name, values in table.items()}

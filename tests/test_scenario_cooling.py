@@ -1,0 +1,203 @@
+"""A row of cooling lines from a scenario file: what [cooling] stands for, and comparisons."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+
+import attrs
+import h5py
+import numpy as np
+import pytest
+
+from posmas_fmi import cli, load, run
+from posmas_fmi.cooling import Loads, controller
+from posmas_fmi.cooling.row import Row, simulate_row
+from posmas_fmi.errors import InputError, ScenarioError
+from posmas_fmi.network import network_from_arcs
+from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law
+from posmas_fmi.scenario.job import make_design_of, run_designed
+
+pytestmark = pytest.mark.slow
+
+ROW = """
+[scenario]
+name = "row"
+until = 300.0
+period = 5.0
+seed = 1
+
+[cooling]
+sizes = [80e3, 40e3, 120e3]
+shortage = 1.0
+water_class = "W32"
+air = {temperature = 297.15, humidity = 0.5}
+
+[signals.load]
+times = [0.0, 60.0]
+values = [[80e3, 40e3, 120e3], [60e3, 50e3, 120e3]]
+
+[network]
+agents = 3
+ring = [1]
+pinned = [1]
+pin_weight = 0.5
+
+[channel]
+delay = 5.0
+
+[controllers.slow]
+law = "pi"
+parameters = {Ti = 240.0}
+
+[compare]
+controllers = ["integral_ff", "slow"]
+practice = "slow"
+"""
+
+
+@pytest.fixture(scope="module")
+def row(tmp_path_factory):
+    path = tmp_path_factory.mktemp("row") / "row.toml"
+    path.write_text(ROW, encoding="utf-8")
+    return load(str(path))
+
+
+@pytest.fixture(scope="module")
+def designed(row):
+    return make_design_of(row)
+
+
+@pytest.fixture(scope="module")
+def compared(row):
+    """Exit code, folder and what was printed."""
+    folder, printed = row.path.parent / "out", io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        code = cli.main(["run", str(row.path), "--out", str(folder)])
+    return code, folder, printed.getvalue()
+
+
+def results(folder: Path) -> dict[str, np.ndarray]:
+    with h5py.File(folder / "results.nc") as file:
+        return {name: np.asarray(file[name]) for name in file if file[name].dtype.kind == "f"}
+
+
+def test_a_comparison_leaves_a_run_of_each_controller(compared) -> None:
+    code, folder, _ = compared
+    assert code == 0
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert summary["verdict"] == "compared"
+    assert list(summary["comparison"]) == ["integral_ff", "slow"]
+    assert summary["practice"] == "slow"
+    assert [limit["name"] for limit in summary["limits"]] == [
+        "band", "positivity", "W32", "dew point",
+    ]  # fmt: skip
+    for name, figures in summary["comparison"].items():
+        table = results(folder / name)
+        deviation = table["supply_temperature"] - table["set_point"][:, None]
+        assert figures["worst_K"] == pytest.approx(np.abs(deviation).max())
+        assert figures["limits"]["dew point"] is True
+        assert set(summary["kpi"]) <= set(figures)
+        own = json.loads((folder / name / "summary.json").read_text(encoding="utf-8"))
+        assert next(iter(own["comparison"].values()))["rms_K"] == figures["rms_K"]
+        design = json.loads((folder / name / "design.json").read_text(encoding="utf-8"))
+        assert design["certified"] == "no"  # the certificate is about (6), which neither is
+    assert summary["comparison"]["slow"]["messages_per_h"] == 0
+    assert summary["comparison"]["integral_ff"]["messages_per_h"] > 0
+    assert "integral_ff" in (folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_controllers_of_a_comparison_have_the_same_loads_and_start(compared) -> None:
+    _, folder, _ = compared
+    ff, slow = (results(folder / name) for name in ("integral_ff", "slow"))
+    np.testing.assert_array_equal(ff["heat_load"], slow["heat_load"])
+    np.testing.assert_array_equal(ff["supply_temperature"][0], slow["supply_temperature"][0])
+    assert np.abs(ff["supply_temperature"][-1] - slow["supply_temperature"][-1]).max() > 1e-3
+
+
+def test_a_scenario_runs_as_the_same_row_from_python(row, designed, tmp_path) -> None:
+    exact = attrs.evolve(row, sensors=None, compare=None)
+    run_designed(exact, designed, tmp_path / "out", report=False)
+    network = network_from_arcs(3, [(3, 1), (1, 2), (2, 3)], [1])
+    expected = simulate_row(
+        Row(
+            attrs.evolve(network, pinning=0.5 * network.pinning),
+            Loads([0.0, 60.0], [[80e3, 40e3, 120e3], [60e3, 50e3, 120e3]]),
+            controller(
+                "integral_ff",
+                K=designed.K[0],
+                E=designed.E,
+                K_q=float(designed.K.sum()) / INTEGRAL_TIME,
+            ),
+            until=300.0,
+            size=np.array([1.0, 0.5, 1.5]),
+            shortage=1.0,
+            delay=5.0,
+            sensor=None,
+        )
+    )
+    table = results(tmp_path / "out")
+    np.testing.assert_allclose(table["supply_temperature"], expected.supply, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(table["valve_position"], expected.valve, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(table["primary_flow"], expected.flow, rtol=0, atol=1e-9)
+
+
+def test_what_a_scenario_says_itself_counts_more(row, tmp_path) -> None:
+    path = tmp_path / "row.toml"
+    path.write_text(ROW + "[plant.parameters]\nstroke_time = 60.0\n", encoding="utf-8")
+    changed = load(str(path))
+    assert changed.plant.parameters["stroke_time"] == 60.0
+    assert changed.plant.parameters["UA"] == row.plant.parameters["UA"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("shortage = 1.0", "shortage = -1.0", r"\$.cooling.shortage: expected a number >= 0"),
+        ("sizes = [80e3, 40e3", "sizes = [40e3", r"\$.cooling.sizes: expected a load > 0"),
+        ('"W32"', '"W33"', "expected one of W17"),
+        ("[signals.load]", "[signals.power]", r"\$.cooling.load: there is no signal 'load'"),
+        ("shortage", "shortages", r"\$.cooling.shortages: unknown key; did you mean shortage"),
+        ("values = [[80e3,", "values = [[", "expected one value or 3"),
+        ("ring = [1]", "ring = [3]", r"\$.network.ring\[0\]: expected different numbers"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, old, new, message) -> None:
+    path = tmp_path / "row.toml"
+    path.write_text(ROW.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=message):
+        load(str(path))
+
+
+def test_unknown_laws_and_parameters_are_named(row, designed) -> None:
+    from posmas_fmi.scenario.compare import controllers
+    from posmas_fmi.scenario.tables import CompareTable, ControlTable
+
+    with pytest.raises(InputError, match=r"parameters.kq: unknown key; known keys: K, K_q"):
+        cooling_law(ControlTable("integral", {"kq": -1.0}), row.cooling, designed)
+    with pytest.raises(InputError, match="expected a number > 0"):
+        cooling_law(ControlTable("pi", {"Ti": 0.0}), row.cooling, designed)
+    twice = attrs.evolve(row, compare=CompareTable(["pi", "pi", "best"], "pid"))
+    with pytest.raises(ScenarioError) as error:
+        controllers(twice)
+    assert [place for place, _ in error.value.problems] == [
+        "$.compare.controllers[1]", "$.compare.controllers[2]", "$.compare.practice",
+    ]  # fmt: skip
+
+
+def test_the_law_says_what_is_measured(row) -> None:
+    plant = attrs.evolve(row.plant, measured={"power": "load", "water": "load", "vale": "kv"})
+    with pytest.raises(ScenarioError) as error:
+        run(attrs.evolve(row, plant=plant, compare=None), row.path.parent / "measured")
+    assert [place for place, _ in error.value.problems] == [
+        "$.plant.measured.valve", "$.plant.measured.vale",
+    ]  # fmt: skip
+
+
+def test_the_command_prints_a_table(compared) -> None:
+    *_, printed = compared
+    assert printed.splitlines()[0].split() == ["integral_ff", "slow"]
+    assert "RMS deviation [K]" in printed
+    assert "slow: " in printed
