@@ -306,7 +306,6 @@ STEPPED = "    *lastSuccessfulTime = INSTANCE(instance)->state.v[AT_TIME];"
     ("answer", "reason"),
     [
         ("*terminateSimulation = true;", "asked to end the simulation"),
-        ("*earlyReturn = true;", "returned early"),
         ("return (fmi3Status)-7;", "-7 (outside the standard)"),
         ("return fmi3Discard;", "2 (Discard)"),
     ],
@@ -319,6 +318,37 @@ def test_odd_answers_of_an_fmu(
     assert expected[0].ended == "failed"
     assert reason in expected[0].reason
     assert_alike(run(Fragile(), tmp_path, "c"), expected)
+
+
+STEP = "    Status status =\n        instance_step("
+EARLY = """    if (communicationStepSize > 0.004) {
+        *eventHandlingNeeded = *terminateSimulation = false;
+        *earlyReturn = true;
+        *lastSuccessfulTime = currentCommunicationPoint + 0.4 * communicationStepSize;
+        return (fmi3Status)instance_step(INSTANCE(instance), currentCommunicationPoint,
+                                         0.4 * communicationStepSize);
+    }
+"""
+
+
+def test_steps_that_return_early_are_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(Fragile(), tmp_path, "c")
+    changed(monkeypatch, 3, STEP, EARLY + STEP)
+    for which in ("c", "numpy"):
+        outcome, rows = run(Fragile(), tmp_path, which)
+        assert outcome.ended == "complete"
+        for name, values in whole[1].items():
+            np.testing.assert_allclose(rows[name], values, rtol=1e-5, atol=1e-7, err_msg=name)
+
+
+def test_an_fmu_that_never_gets_to_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck = EARLY.split("        return")[0].replace("0.4 * communicationStepSize", "0.0")
+    changed(monkeypatch, 3, STEP, f"{stuck}        return fmi3OK;\n    }}\n{STEP}")
+    outcome, _ = run(Fragile(), tmp_path, "c")
+    assert outcome.ended == "failed"
+    assert "returned early at 0.0 s" in outcome.reason
 
 
 def test_an_fmu_that_gives_no_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import FmuCallError
+from posmas_fmi.cosim.served import Served, needs_python
+from posmas_fmi.errors import FmuCallError, FmuError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
 from posmas_fmi.fmu.variables import Ports
@@ -232,13 +233,17 @@ class Fmus:
     ) -> None:
         self._instances = list(instances)
         self._messages = messages
-        self._readings = tuple(readings)
+        self._inputs, self._readings = tuple(inputs), tuple(readings)
         self._keep: list[Any] = []  # what the structures point to
+        self._served = Served()
         kinds = list(zip((i.file for i in instances), inputs, readings, strict=True))
         number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
         bindings = (_Binding * len(number))(*(self._bind(*kind) for kind in number))
         places = np.array([number[kind] for kind in kinds], dtype=np.int64)
-        self._components = np.array([i.component for i in instances], dtype=np.uintp)
+        self._components = np.array(
+            [self._component(*kind, i) for kind, i in zip(kinds, instances, strict=True)],
+            dtype=np.uintp,
+        )
         self.input_at = _starts([len(ports.variables) for ports in inputs])
         self.reading_at = _starts([len(ports.variables) for ports in readings])
         self._keep += [bindings, places]
@@ -263,9 +268,22 @@ class Fmus:
     def replace(self, number: int, instance: FmuInstance) -> None:
         """Put a fresh instance of the same file in the place of one that has failed."""
         self._instances[number] = instance
-        self._components[number] = instance.component
+        ports = self._inputs[number], self._readings[number]
+        self._components[number] = self._component(instance.file, *ports, instance)
+
+    def _component(
+        self, file: FmuFile, inputs: PortMap, readings: PortMap, instance: FmuInstance
+    ) -> int:
+        ports = (file.ports(one.variables) for one in (inputs, readings))
+        return self._served.add(instance) if needs_python(file, *ports) else instance.component
 
     def _bind(self, file: FmuFile, inputs: PortMap, readings: PortMap) -> _Binding:
+        if needs_python(file, file.ports(inputs.variables), file.ports(readings.variables)):
+            served = self._served
+            return _Binding(
+                *(3, served.get, served.set, served.do_step),
+                *(self._served_ports(file, ports) for ports in (inputs, readings)),
+            )
         prefix, real = f"fmi{file.version}", "Real" if file.version == 2 else "Float64"
         return _Binding(
             file.version,
@@ -280,24 +298,34 @@ class Fmus:
         n = len(ports.names)
         in_order = ports.size == n and bool((ports.places == np.arange(n)).all())
         places = None if in_order else ports.places.astype(np.int64)
-        scale = offset = None
-        if port_map.converts:
-            scale, offset = np.array(port_map.scale), np.array(port_map.offset)
-        self._keep += [ports, places, scale, offset]
-
-        def address(array: Any) -> int | None:
-            return None if array is None else array.ctypes.data
-
+        self._keep += [ports, places]
         return _Ports(
             ctypes.addressof(ports.references),
             len(ports.references),
             ports.size,
             n,
-            address(places),
-            address(scale),
-            address(offset),
+            None if places is None else places.ctypes.data,
+            *self._conversion(port_map),
             ports.partial,
         )
+
+    def _served_ports(self, file: FmuFile, port_map: PortMap) -> _Ports:
+        """Ports that Python reads and writes: one reference, their number, stands for all."""
+        ports = file.ports(port_map.variables)
+        n = len(ports.names)
+        reference = (ctypes.c_uint32 * 1)(self._served.number(ports))
+        self._keep.append(reference)
+        return _Ports(
+            ctypes.addressof(reference), int(n > 0), n, n, None, *self._conversion(port_map), 0
+        )
+
+    def _conversion(self, port_map: PortMap) -> tuple[int | None, int | None]:
+        """Addresses of scale and offset; None where nothing is converted."""
+        if not port_map.converts:
+            return None, None
+        scale, offset = np.array(port_map.scale), np.array(port_map.offset)
+        self._keep += [scale, offset]
+        return scale.ctypes.data, offset.ctypes.data
 
     @property
     def address(self) -> int:
@@ -319,8 +347,18 @@ class Fmus:
             _LOG.warning("%d more calls of FMUs returned Warning", report.warnings - 1)
 
     def error(self, failure: Incident, time: float) -> FmuCallError:
-        """Return what went wrong as an error; the run stood at `time` [s]."""
+        """Return what went wrong as an error; the run stood at `time` [s].
+
+        What a call through Python raised, and is no `FmuError`, is raised here.
+        """
         instance, function, messages = self._call_of(failure, time)
+        raised = self._served.failure(instance)
+        if isinstance(raised, FmuCallError):
+            return raised
+        if isinstance(raised, FmuError):
+            return instance.error(function, raised.message)
+        if raised is not None:
+            raise raised
         if failure.call in (_TERMINATED, _EARLY):
             return instance.ended_early(failure.call == _TERMINATED, failure.value)
         if failure.call == _NOT_FINITE:

@@ -254,6 +254,11 @@ class FmuFile:
         return self.about.variable(name)
 
     @property
+    def in_python(self) -> bool:
+        """Whether steps need more than one call, which C loops leave to `FmuInstance.do_step`."""
+        return False
+
+    @property
     def units(self) -> Units:
         """The units that the file defines."""
         return self.about.units

@@ -16,6 +16,8 @@ typedef int Set3(void *, const uint32_t[], size_t, const double[], size_t);
 typedef int Step3(void *, double, double, bool, bool *, bool *, bool *, double *);
 
 enum { OK, WARNING };
+enum { MOST_RETURNS = 100000 }; /* before the end of one step */
+#define SAME 1e-9               /* of a step: times that are the same */
 
 static int64_t said(const Fmus *f)
 {
@@ -109,15 +111,23 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
         status = ((Step2 *)b->do_step)(component, t, h, 0);
         return status == OK || odd(status, CALL_STEP, instance, before, report);
     }
-    bool event = false, terminate = false, early = false;
-    double reached = t;
-    status = ((Step3 *)b->do_step)(component, t, h, false, &event, &terminate, &early, &reached);
-    if (status != OK && !odd(status, CALL_STEP, instance, before, report))
-        return 0;
-    if (!terminate && !early)
-        return 1;
-    const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
-    return fail(report, (Incident){.call = call, .instance = instance, .value = reached});
+    double begin_at = t, length = h;
+    for (int64_t returns = 0;; returns++) {
+        bool event = false, terminate = false, early = false;
+        double reached = begin_at;
+        status = ((Step3 *)b->do_step)(component, begin_at, length, false, &event, &terminate,
+                                       &early, &reached);
+        if (status != OK && !odd(status, CALL_STEP, instance, before, report))
+            return 0;
+        if (terminate || (early && returns == MOST_RETURNS)) {
+            const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
+            return fail(report, (Incident){.call = call, .instance = instance, .value = reached});
+        }
+        if (!early || reached >= t + h - SAME * h)
+            return 1;
+        begin_at = reached; /* go on to the end of the step */
+        length = t + h - reached;
+    }
 }
 
 int fmus_read(const Fmus *f, int64_t instance, double *values, double *scratch, Report *report)
