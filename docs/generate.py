@@ -1,11 +1,13 @@
 """Write the pages of the documentation that are made from the code: `python docs/generate.py`.
 
-`commands.md` comes from the parser of the command line. Edit that, not the page.
+`commands.md` comes from the parser of the command line, `defects.md` from the corpus of the tests.
+Edit those, not the pages.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -119,7 +121,42 @@ def _cell(text: str) -> str:
     return text.replace("<", "&lt;").replace(">", "&gt;")
 
 
-PAGES = {"commands.md": commands_page}
+# ---- defects --------------------------------------------------------------------------------
+
+
+DEFECTS = """
+# Defects and findings
+
+What `posmas-fmi check` says about FMUs that are made to have one defect each.
+`tests/hostile/` builds them from our own C and XML, and `tests/test_hostile.py` checks every line
+of these tables: the finding is there, the exit code is this one, and neither the process that
+checks nor any file or process of the trial is left behind.
+
+Place is a part of where the finding points to.
+Exit codes: 0 fine, 1 usable with errors, 3 not usable; see [check](check.md).
+"""
+
+
+def defects_page() -> str:
+    """Return the page of defects, from the corpus of the tests."""
+    sys.path.insert(0, str(DOCS.parent / "tests"))
+    try:
+        from hostile.corpus import GROUPS
+    finally:
+        del sys.path[0]
+    parts = [NOTE.format(source="tests/hostile/corpus.py"), DEFECTS]
+    parts.append(f"{sum(map(len, GROUPS.values()))} defects:")
+    for title, group in GROUPS.items():
+        parts += [f"\n## {title}\n", "| defect | finding | severity | place | exit |"]
+        parts.append("|---|---|---|---|---|")
+        parts += [
+            f"| {_cell(d.text)} | `{d.code}` | {d.severity} | {d.place} | {d.exit_code} |"
+            for d in group
+        ]
+    return "\n".join([*parts, ""])
+
+
+PAGES = {"commands.md": commands_page, "defects.md": defects_page}
 
 if __name__ == "__main__":
     main()

@@ -203,13 +203,22 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> int:
     from posmas_fmi.fmu.check.preflight import check_fmu
+    from posmas_fmi.fmu.check.supervisor import Bounds, Supervisor
     from posmas_fmi.fmu.check.text import to_text
 
     made = []
-    for path in arguments.fmus:
-        made.append(check_fmu(path, arguments.inputs, arguments.outputs))
-        if not arguments.json:
-            print(to_text(made[-1]), flush=True)
+    names = arguments.inputs, arguments.outputs
+    with Supervisor(Bounds(call=arguments.deadline)) as supervisor:
+        for path in arguments.fmus:
+            made.append(
+                check_fmu(
+                    *(path, *names, dict(arguments.set)),
+                    run=not arguments.static,
+                    supervisor=supervisor,
+                )
+            )
+            if not arguments.json:
+                print(to_text(made[-1]), flush=True)
     if arguments.json:
         _print_json({"fmus": [one.to_dict() for one in made]})
     return max(one.exit_code for one in made)
@@ -465,6 +474,19 @@ def _parser() -> argparse.ArgumentParser:
         check.add_argument(
             option, dest=dest, nargs="+", action="extend", default=[], metavar="NAME", help=text
         )
+    check.add_argument(
+        "--set",
+        type=_assignment,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters, start values and inputs",
+    )
+    check.add_argument("--static", action="store_true", help="examine it only, run nothing of it")
+    check.add_argument(
+        "--deadline", type=_positive, default=10.0, metavar="S", help="of one call [s], default 10"
+    )
     check.add_argument("--json", action="store_true", help="print everything as JSON")
     return parser
 

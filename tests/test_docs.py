@@ -95,7 +95,7 @@ def generated():
     return runpy.run_path(str(ROOT / "docs" / "generate.py"))
 
 
-@pytest.mark.parametrize("page", ["commands.md"])
+@pytest.mark.parametrize("page", ["commands.md", "defects.md"])
 def test_pages_made_from_the_code_are_up_to_date(generated, page):
     """If not: `python docs/generate.py`."""
     assert generated["PAGES"][page]() == (ROOT / "docs" / page).read_text(encoding="utf-8")

@@ -113,5 +113,5 @@ def test_an_fmu_that_never_gets_to_the_end_is_an_error(
     monkeypatch.setattr(FmuInstance, "step_once", lambda self, time, step: Step(time, True))
     with FmuFile(example_1().fmu(3, tmp_path)) as file, file.instantiate("stuck") as instance:
         instance.initialise()
-        with pytest.raises(FmuError, match="returned early 100000 times"):
+        with pytest.raises(FmuError, match="returned early 101 times"):
             instance.do_step(0.0, 0.1)

@@ -46,14 +46,17 @@ class About:
         Raises
         ------
         FmuError
-            If it is not of FMI 2.0 or 3.
+            If it is not of FMI 2.0 or 3, or a variable cannot be read.
         """
         where, told = str(path), description.fmiVersion
         if told != "2.0" and not told.startswith("3."):
             raise FmuError(f"expected FMI 2.0 or 3.0 (got {told})", where)
         if kind is None:
             kind = "Co-Simulation" if description.coSimulation else "Model Exchange"
-        variables = {v.name: v for v in map(Variable.read, description.modelVariables)}
+        try:
+            variables = {v.name: v for v in map(Variable.read, description.modelVariables)}
+        except (ValueError, TypeError) as error:
+            raise ArchiveError(f"cannot read the variables: {error}", where) from error
         version: Literal[2, 3] = 2 if told == "2.0" else 3
         return cls(path, version, description, kind, Variables(variables, where))
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from posmas_fmi.errors import FmuError
 
-Trace = Callable[[str], None]
+# told the name before each call; what it returns, if anything, is told the result after it
+Trace = Callable[[str], Callable[[Any], None] | None]
 
 
 class Binding:
@@ -33,7 +34,8 @@ class Binding:
     needed : sequence of str, optional
         Functions without which the binary is of no use.
     trace : callable, optional
-        Called with the name before each call, so that a crash can be told by its last call.
+        Called with the name before each call, so that a crash can be told by its last call; a
+        function that it returns is called with the result.
 
     Attributes
     ----------
@@ -56,8 +58,7 @@ class Binding:
         needed: Sequence[str] = (),
         trace: Trace | None = None,
     ) -> None:
-        if trace is not None:
-            trace("dlopen")
+        done = None if trace is None else trace("dlopen")
         before = os.getcwd()
         os.chdir(library.parent)
         try:
@@ -66,6 +67,8 @@ class Binding:
             raise FmuError(f"the binary cannot be loaded: {error}", where) from error
         finally:
             os.chdir(before)
+        if done is not None:
+            done(None)
         self.functions: dict[str, Callable[..., Any]] = {}
         missing: list[str] = []
         for name, argument_types, result in _signatures(api):
@@ -121,7 +124,10 @@ def _absent(name: str, where: str) -> Callable[..., Any]:
 
 def _traced(name: str, function: Callable[..., Any], trace: Trace) -> Callable[..., Any]:
     def traced(*arguments: object) -> Any:
-        trace(name)
-        return function(*arguments)
+        done = trace(name)
+        result = function(*arguments)
+        if done is not None:
+            done(result)
+        return result
 
     return traced

@@ -214,21 +214,33 @@ def bring_to(instance: FmuInstance, at: float, values: Values, step: float) -> N
 
 def start_time(file: FmuFile) -> float:
     """Start of the default experiment [s]; 0 if the FMU tells none."""
-    experiment = file.description.defaultExperiment
-    return float(experiment.startTime) if experiment and experiment.startTime else 0.0
+    return _experiment(file, "startTime") or 0.0
 
 
 def default_step(file: FmuFile) -> float:
     """Communication step [s] that suits the FMU: its own, else a thousandth of its experiment."""
-    interface = file.description.coSimulation
-    fixed = getattr(interface, "fixedInternalStepSize", None)
-    experiment = file.description.defaultExperiment
-    stop = float(experiment.stopTime) if experiment and experiment.stopTime else 0.0
-    for candidate in (fixed, experiment.stepSize if experiment else None):
-        if candidate and float(candidate) > 0:
-            return float(candidate)
-    duration = stop - start_time(file)
-    return duration / 1000 if duration > 0 else 1e-3
+    fixed = _positive(getattr(file.description.coSimulation, "fixedInternalStepSize", None))
+    step = fixed or _positive(_experiment(file, "stepSize"))
+    duration = (_experiment(file, "stopTime") or 0.0) - start_time(file)
+    return step or (duration / 1000 if duration > 0 else 1e-3)
+
+
+def _experiment(file: FmuFile, key: str) -> float | None:
+    """Return what the default experiment says; None if that is no finite number."""
+    return _finite(getattr(file.description.defaultExperiment, key, None))
+
+
+def _finite(text: object) -> float | None:
+    try:
+        value = float(str(text))
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _positive(text: object) -> float | None:
+    value = _finite(text)
+    return value if value is not None and value > 0 else None
 
 
 # ---- the two interfaces -------------------------------------------------------------------------

@@ -32,7 +32,7 @@ class FmuFile:
     messages : Messages, optional
         Where the messages of its instances go; kept by Python functions if left out.
     trace : callable, optional
-        Called with the name before each call into the binary.
+        Called with the name before each call into the binary; see `Binding`.
     unpacked : Path, optional
         Where somebody has unpacked the archive already, who removes it again.
 

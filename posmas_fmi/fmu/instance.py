@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _MOST_RETURNS = 100_000  # before the end of one step
+_MOST_STUCK = 100  # of them at the same time
 _SAME = 1e-9  # of a step: times that are the same
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
@@ -225,11 +226,15 @@ class FmuInstance:
             Also if the FMU asks to end the simulation.
         """
         end, now, length = time + step, time, step
+        stuck = 0
         for _ in range(_MOST_RETURNS):
             done = self.step_once(now, length)
             if not done.early or done.reached >= end - _SAME * step:
                 self.time = end
                 return
+            stuck = 0 if done.reached > now else stuck + 1
+            if stuck > _MOST_STUCK:
+                raise self.error("DoStep", f"returned early {stuck} times at {now!r} s")
             now, length = done.reached, end - done.reached
         raise self.error("DoStep", f"returned early {_MOST_RETURNS} times, at last at {now!r} s")
 

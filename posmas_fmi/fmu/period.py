@@ -124,4 +124,7 @@ def _multiple(length: float, unit: float) -> bool:
 
 
 def _number(given: Any) -> float | None:
-    return None if given in (None, "") else float(given)
+    try:
+        return None if given in (None, "") else float(given)
+    except (TypeError, ValueError):  # as if it were not there; `posmas-fmi check` tells
+        return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from posmas_fmi.fmu.check.binaries import Binary, binary_findings, read_binaries
 from posmas_fmi.fmu.check.described import Described, Description, read_description
 from posmas_fmi.fmu.check.description import description_findings, strict_findings
 from posmas_fmi.fmu.check.finding import SEVERITIES, Finding, worst
+from posmas_fmi.fmu.check.supervisor import Bounds, Outcome, Supervisor
 
 FINE, ERRORS, UNUSABLE = 0, 1, 3  # exit codes
 VERDICTS = {FINE: "fine", ERRORS: "usable, with errors", UNUSABLE: "not usable"}
@@ -33,12 +34,15 @@ class Preflight:
     told : Description or None
         What its model description says; None if it could not be read safely.
     binaries : tuple of Binary
+    results : dict
+        Measurements of the trial by name; empty without one.
     """
 
     path: Path
     findings: tuple[Finding, ...]
     told: Description | None = None
     binaries: tuple[Binary, ...] = ()
+    results: dict[str, Any] = attrs.field(factory=dict)
 
     @property
     def exit_code(self) -> int:
@@ -78,19 +82,35 @@ class Preflight:
             "inputs": [_port(v) for v in self.ports("input")],
             "outputs": [_port(v) for v in self.ports("output")],
             "annotations": list(told.annotations) if told else [],
+            "trial": self.results,
         }
 
 
 def check_fmu(
-    path: str | Path, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
+    path: str | Path,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    values: Mapping[str, float] | None = None,
+    *,
+    run: bool = True,
+    supervisor: Supervisor | None = None,
+    bounds: Bounds | None = None,
 ) -> Preflight:
-    """Examine an FMU of FMI 1, 2 or 3; nothing of it is run.
+    """Examine an FMU of FMI 1, 2 or 3, then try it in a process of its own.
 
     Parameters
     ----------
     path : path-like
     inputs, outputs : sequence of str
         Variables that will carry the protocol's u and y; must be there.
+    values : mapping, optional
+        Parameters, start values and inputs by name; those of the file by default.
+    run : bool
+        Whether to try it if nothing fatal was found before.
+    supervisor : Supervisor, optional
+        That tries it, to spare a start for each FMU; one for this FMU alone by default.
+    bounds : Bounds, optional
+        What the trial may take.
 
     Returns
     -------
@@ -107,24 +127,60 @@ def check_fmu(
     >>> from posmas_fmi.fmu.build import agent_fmu
     >>> g = VectorFunction.parse(["0"], ["t", "x1"])
     >>> path = agent_fmu(g, VectorFunction.parse(["tanh(u1)"], ["u1"]), 1, 1, 1)
-    >>> check_fmu(path).verdict
+    >>> check_fmu(path, run=False).verdict
     'fine'
     """
     path = Path(path)
+    values = dict(values or {})
     if not path.is_file():
         raise InputError("expected an FMU (there is no such file)", str(path))
     findings = examine(path, whole=True)
     if worst(findings) == "fatal":
         return Preflight(path, _ordered(findings))
     told = read_description(read_entry(path, DESCRIPTION))
-    _names_exist(path, told, [*inputs, *outputs])
+    _names_exist(path, told, [*inputs, *outputs, *values])
     findings += description_findings(told)
-    binaries: list[Binary] = []
-    if worst(findings) != "fatal":
-        binaries = read_binaries(path)
-        findings += binary_findings(path, told, binaries)
-        findings += strict_findings(path, told)
-    return Preflight(path, _ordered(findings), told, tuple(binaries))
+    if worst(findings) == "fatal":
+        return Preflight(path, _ordered(findings), told)
+    binaries = read_binaries(path)
+    findings += binary_findings(path, told, binaries)
+    findings += strict_findings(path, told)
+    if not run or worst(findings) == "fatal":
+        return Preflight(path, _ordered(findings), told, tuple(binaries))
+    outcome = _tried(path, told, _job(told, inputs, outputs, values), supervisor, bounds)
+    findings += outcome.findings
+    return Preflight(path, _ordered(findings), told, tuple(binaries), outcome.results)
+
+
+def _job(
+    told: Description, inputs: Sequence[str], outputs: Sequence[str], values: dict[str, float]
+) -> dict[str, Any]:
+    interface = told.interface("Co-Simulation") or told.interface("Model Exchange")
+    assert interface is not None
+    return {
+        "interface": interface.kind,
+        "inputs": tuple(inputs),
+        "outputs": tuple(outputs),
+        "values": values,
+        "single": interface.has("canBeInstantiatedOnlyOncePerProcess"),
+        "serialises": interface.has("canSerializeFMUstate")
+        or interface.has("canSerializeFMUState"),
+    }
+
+
+def _tried(
+    path: Path,
+    told: Description,
+    job: dict[str, Any],
+    supervisor: Supervisor | None,
+    bounds: Bounds | None,
+) -> Outcome:
+    if told.major == 1:
+        return Outcome((Finding("note", "not-tried", "", "an FMU of FMI 1.0 is not run"),))
+    if supervisor is not None:
+        return supervisor.examine(path, job, bounds)
+    with Supervisor(bounds) as own:
+        return own.examine(path, job)
 
 
 def _ordered(findings: Sequence[Finding]) -> tuple[Finding, ...]:
@@ -174,6 +230,45 @@ def facts(made: Preflight) -> Iterator[tuple[str, str]]:
         able = [flag for flag in interface.flags if interface.has(flag)]
         if able:
             yield interface.kind, ", ".join(able)
+
+
+def measured(made: Preflight) -> Iterator[tuple[str, str]]:
+    """Return label and text of what the trial has measured."""
+    found = made.results
+
+    def seconds(name: str) -> str:
+        return f"{_engineering(found[name])}s" if name in found else "-"
+
+    if "load_s" not in found:
+        return
+    times = (f"load {seconds('load_s')}", f"instantiate {seconds('instantiate_s')}")
+    yield "trial", ", ".join([*times, f"initialise {seconds('initialise_s')}"])
+    if "steps" in found:
+        yield (
+            "step",
+            f"{found['steps']} of {found['step']:g} s: median {seconds('step_median_s')}, "
+            f"longest {seconds('step_max_s')}",
+        )
+    words = {
+        "reset_noise": "after a reset",
+        "replay_noise": "from a saved state",
+        "serialise_noise": "from a serialised state",
+        "repeat_noise": "in another instance",
+    }
+    again = [
+        f"{text} {'the same bits' if found[name] == 0 else f'off by {found[name]:.2g}'}"
+        for name, text in words.items()
+        if name in found
+    ]
+    if again:
+        yield "done again", ", ".join(again)
+
+
+def _engineering(value: float) -> str:
+    for unit, size in (("", 1.0), ("m", 1e-3), ("µ", 1e-6)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value / 1e-9:.3g} n"
 
 
 _SHOWN = 8  # ports in the text

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator
 
 from posmas_fmi.fmu.check.finding import Finding
-from posmas_fmi.fmu.check.preflight import Preflight, facts
+from posmas_fmi.fmu.check.preflight import Preflight, facts, measured
 
 _WIDTH = 100
 _SEVERITY = 9  # columns
@@ -18,7 +18,7 @@ def to_text(made: Preflight) -> str:
     Control characters that an FMU put into its names are shown, not sent to the terminal.
     """
     lines = [str(made.path)]
-    for label, text in facts(made):
+    for label, text in (*facts(made), *measured(made)):
         lines += _wrapped(f"  {label:<16}", text)
     for finding in made.findings:
         lines += _finding(finding)

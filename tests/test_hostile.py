@@ -1,0 +1,80 @@
+"""Each defect gives its finding; nothing an FMU does ends the process that checks it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import hostile
+import pytest
+
+from posmas_fmi.fmu.check.preflight import Preflight, check_fmu
+from posmas_fmi.fmu.check.supervisor import Supervisor
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="trials need fork"),
+    pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory limits need /proc"),
+]
+GOOD = ("good 2", "good 3")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("hostile")
+
+
+@pytest.fixture(scope="module")
+def checked(folder: Path) -> dict[str, Preflight]:
+    """All of them, checked two at a time, all temporary files in one folder."""
+    defects = sorted(hostile.DEFECTS, key=lambda d: d.bounds.call)  # those that wait come first
+    names = [*(d.name for d in defects), *GOOD]
+    bounds = [*(d.bounds for d in defects), hostile.BOUNDS, hostile.BOUNDS]
+    paths = [hostile.path(name) for name in names]
+
+    def check_half(half: int) -> list[tuple[str, Preflight]]:
+        with Supervisor() as supervisor:
+            return [
+                (names[k], check_fmu(paths[k], supervisor=supervisor, bounds=bounds[k]))
+                for k in range(half, len(names), 2)
+            ]
+
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(2) as pool:
+        patch.setattr(tempfile, "tempdir", str(folder))
+        return dict(pair for half in pool.map(check_half, (0, 1)) for pair in half)
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_without_a_defect_there_is_nothing_to_say(checked: dict[str, Preflight], name: str) -> None:
+    made = checked[name]
+    assert made.findings == ()
+    assert made.results["steps"] > 10
+    assert made.results["replay_noise"] == made.results["reset_noise"] == 0
+
+
+@pytest.mark.parametrize("defect", hostile.DEFECTS, ids=lambda d: d.name)
+def test_each_defect_has_its_finding(checked: dict[str, Preflight], defect: hostile.Defect) -> None:
+    made = checked[defect.name]
+    found = [(f.severity, f.code) for f in made.findings]
+    assert (defect.severity, defect.code) in found, [str(f) for f in made.findings]
+    places = [f.place for f in made.findings if f.code == defect.code]
+    assert any(defect.place.lower() in place.lower() for place in places), places
+    assert made.exit_code == defect.exit_code, [str(f) for f in made.findings]
+
+
+def test_no_file_and_no_process_is_left(checked: dict[str, Preflight], folder: Path) -> None:
+    assert checked
+    assert list(folder.iterdir()) == []
+    left = []
+    for process in Path("/proc").glob("[0-9]*/cwd"):
+        with suppress(OSError):
+            left += [process] if str(folder) in os.readlink(process) else []
+    assert left == []
+
+
+def test_there_are_more_than_a_hundred() -> None:
+    names = [defect.name for defect in hostile.DEFECTS]
+    assert len(set(names)) == len(names) > 100
