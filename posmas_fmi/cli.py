@@ -58,6 +58,15 @@ def _run(arguments: argparse.Namespace) -> int:
     from posmas_fmi.scenario import load, run
 
     scenario = load(arguments.scenario, arguments.period, arguments.until, arguments.seed)
+    if arguments.schedule:
+        from posmas_fmi.scenario.schedule import schedule_of
+
+        schedule = schedule_of(scenario)
+        if arguments.json:
+            _print_json(schedule.to_dict())
+        else:
+            print(schedule.to_text())
+        return DONE
     folder = arguments.out or Path("out") / scenario.name
     result = run(scenario, folder, _progress, command=_command_line(arguments))
     summary, certificate = result.summary, result.design.certificate
@@ -387,6 +396,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
     run.add_argument("--seed", type=int, metavar="N", help="of every random number")
     run.add_argument("--json", action="store_true", help="print the summary as JSON")
+    run.add_argument(
+        "--schedule", action="store_true", help="print what a communication step does; do not run"
+    )
 
     design = add("design", _design, "find gains and prove what they do")
     design.add_argument("scenario", help=_SCENARIO)

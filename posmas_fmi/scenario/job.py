@@ -24,6 +24,7 @@ from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.start_values import grouped
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
@@ -31,6 +32,7 @@ from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.faults import describe, make_episodes
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
+from posmas_fmi.scenario.schedule import make_schedule
 from posmas_fmi.scenario.verdict import summarise
 
 log = logging.getLogger(__name__)
@@ -148,6 +150,9 @@ def run_designed(
     designed = attrs.evolve(designed, network=law_network(scenario, designed))
     files = fmu_files(scenario)
     instances = make_instances(scenario, files, extras(scenario))
+    if scenario.settings.coupling == "iterate":
+        abouts = {path: read_about(path) for path in dict.fromkeys(files)}
+        make_schedule(scenario, instances, [abouts[path] for path in files])
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     make_folder(folder)

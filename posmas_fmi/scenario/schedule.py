@@ -1,0 +1,263 @@
+"""The schedule of a run as data: what is done in a communication step, who is fed, how late."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.cosim.fmu_plant import PlantSpec
+from posmas_fmi.errors import InputError
+from posmas_fmi.fmu.about import About, read_about
+from posmas_fmi.scenario.build import Scenario
+from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
+
+MANY = 6  # names that are printed of a long list
+EDGES = 200  # edges
+
+
+@attrs.frozen
+class Action:
+    """One thing that the master does in a communication step.
+
+    Attributes
+    ----------
+    do : str
+        ``read``, ``measure``, ``send``, ``control``, ``set``, ``step``, ``save``, ``restore``.
+    who : tuple of str
+        Agents and components.
+    detail : str
+    """
+
+    do: str
+    who: tuple[str, ...]
+    detail: str = ""
+
+
+@attrs.frozen
+class Edge:
+    """One thing that an instance is fed with.
+
+    Attributes
+    ----------
+    source : str
+        ``instance.variable``, ``signal`` or ``controller``.
+    target : str
+        ``instance.variable``.
+    delay : int
+        Communication steps between the time at which the source has a value and that from which
+        on the input has it.
+    feedthrough : bool
+        Whether the source follows inputs of its FMU at once, so that the value is a step older
+        still than the delay says.
+    """
+
+    source: str
+    target: str
+    delay: int
+    feedthrough: bool
+
+
+@attrs.frozen
+class Schedule:
+    """What happens in each communication step, in this order.
+
+    Attributes
+    ----------
+    period : float
+        Communication step [s].
+    actions : tuple of Action
+    edges : tuple of Edge
+        Beside the network of the agents.
+    loops : tuple of tuple of str
+        Instances that feed each other in a circle.
+    every : dict of str to int
+        Instances with a longer period, in communication steps.
+    """
+
+    period: float
+    actions: tuple[Action, ...]
+    edges: tuple[Edge, ...]
+    loops: tuple[tuple[str, ...], ...]
+    every: dict[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return attrs.asdict(self)
+
+    def to_text(self) -> str:
+        """Return it for people."""
+        lines = [f"communication step {self.period:g} s; at each communication point:"]
+        for k, action in enumerate(self.actions, 1):
+            detail = f" ({action.detail})" if action.detail else ""
+            lines.append(f"  {k}. {action.do:8} {_few(action.who)}{detail}")
+        if self.every:
+            lines.append("longer periods:")
+            lines += [f"  {name}: every {n} steps" for name, n in self.every.items()]
+        if self.edges:
+            lines.append("beside the network:")
+            for edge in self.edges[:EDGES]:
+                late = f"{edge.delay} step{'s' if edge.delay != 1 else ''} late"
+                more = ", and its source follows inputs at once" if edge.feedthrough else ""
+                lines.append(f"  {edge.source} -> {edge.target}: {late}{more}")
+            if len(self.edges) > EDGES:
+                lines.append(f"  and {len(self.edges) - EDGES} more (all with --json)")
+        for loop in self.loops:
+            lines.append(f"loop: {' -> '.join((*loop, loop[0]))}")
+        return "\n".join(lines)
+
+
+def schedule_of(scenario: Scenario) -> Schedule:
+    """Return the schedule of a scenario without running it.
+
+    Raises
+    ------
+    PosmasError
+        As `make_schedule`, or if the FMUs or the wiring do not fit.
+    """
+    files = fmu_files(scenario)
+    abouts = {path: read_about(path) for path in dict.fromkeys(files)}
+    return make_schedule(
+        scenario, make_instances(scenario, files), [abouts[path] for path in files]
+    )
+
+
+def make_schedule(scenario: Scenario, instances: Instances, abouts: list[About]) -> Schedule:
+    """Return the schedule of a run, and check that the FMUs allow it.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    instances : Instances
+    abouts : list of About
+        What the FMU of each instance says about itself.
+
+    Raises
+    ------
+    InputError
+        If steps are to be repeated and an FMU cannot go back.
+    """
+    names = tuple(spec.name for spec in instances.specs)
+    N, coupling = scenario.network.N, scenario.settings.coupling
+    agents, components = names[:N], names[N:]
+    if coupling == "iterate":
+        _require_rollback(names, abouts)
+    late = {name: k + 1 if coupling == "gauss-seidel" else 0 for k, name in enumerate(components)}
+    actions = [
+        Action("read", names, "outputs, then states where they are shown"),
+        Action("measure", agents, "through the sensors, with what else is measured"),
+        Action("send", agents, "over the arcs; what has arrived is held, else the last message"),
+        Action("control", agents, "equation (6) and the observer, or another law"),
+    ]
+    stages = [agents, *((name,) for name in components)] if any(late.values()) else [names]
+    if coupling == "iterate":
+        actions.append(Action("save", names, "states of the FMUs"))
+    for stage in stages:
+        actions.append(Action("set", stage, "inputs, held over the step"))
+        actions.append(Action("step", stage))
+    if coupling == "iterate":
+        actions.append(
+            Action("restore", names, "and set, step and read again, until readings stay")
+        )
+    return Schedule(
+        scenario.clock.h,
+        tuple(actions),
+        tuple(_edges(instances, abouts, late, coupling)),
+        _loops(instances),
+        {name: int(n) for name, n in zip(names, instances.every, strict=True) if n > 1},
+    )
+
+
+def _require_rollback(names: tuple[str, ...], abouts: list[About]) -> None:
+    for name, about in zip(names, abouts, strict=True):
+        interface = about.description.coSimulation
+        if about.kind == "Co-Simulation" and not interface.canGetAndSetFMUstate:
+            raise InputError(
+                f"{name}: {about.path.name} cannot give and take back its state, so its steps "
+                'cannot be repeated; take coupling = "jacobi" or "gauss-seidel"',
+                "$.scenario.coupling",
+            )
+
+
+def _owner(instances: Instances) -> tuple[Any, list[PlantSpec]]:
+    widths = [len(spec.readings.variables) for spec in instances.specs]
+    return np.concatenate([[0], np.cumsum(widths)]), list(instances.specs)
+
+
+def _feeds(instances: Instances) -> list[tuple[int, str, int, str]]:
+    """Source instance (-1: a signal) and variable, target instance and variable, of each term."""
+    at, specs = _owner(instances)
+    found = []
+    for target, extras in enumerate(instances.wiring.extras):
+        inputs = specs[target].inputs.variables
+        first = len(inputs) - len(extras)
+        for k, extra in enumerate(extras):
+            for term in extra.terms:
+                if term.source < 0:
+                    found.append((-1, f"signal {-1 - term.source}", target, inputs[first + k]))
+                    continue
+                source = int(np.searchsorted(at, term.source, side="right")) - 1
+                variable = specs[source].readings.variables[term.source - int(at[source])]
+                found.append((source, variable, target, inputs[first + k]))
+    return found
+
+
+def _edges(
+    instances: Instances, abouts: list[About], late: dict[str, int], coupling: str
+) -> list[Edge]:
+    edges = []
+    names = [spec.name for spec in instances.specs]
+    for source, variable, target, to in _feeds(instances):
+        end = f"{names[target]}.{to}"
+        if source < 0:
+            edges.append(Edge(variable, end, 0, False))
+            continue
+        earlier = late.get(names[source], 0) < late.get(names[target], 0)
+        known_at_end = earlier or coupling == "iterate"
+        edges.append(
+            Edge(
+                f"{names[source]}.{variable}",
+                end,
+                0 if known_at_end else 1,
+                feeds_through(abouts[source], variable),
+            )
+        )
+    return edges
+
+
+def feeds_through(about: About, variable: str) -> bool:
+    """Whether a variable follows an input of the FMU at once, by its model structure.
+
+    Parameters
+    ----------
+    about : About
+    variable : str
+        Its name, or that of an element.
+    """
+    whole, _ = about.names.resolve(variable)
+    for unknown in about.description.outputs:
+        if unknown.variable.name == whole.name:
+            if unknown.dependencies is None:
+                return True  # nothing is said: on everything
+            return any(other.causality == "input" for other in unknown.dependencies)
+    return False
+
+
+def _loops(instances: Instances) -> tuple[tuple[str, ...], ...]:
+    import networkx
+
+    graph = networkx.DiGraph()
+    for source, _, target, _ in _feeds(instances):
+        if source >= 0:
+            graph.add_edge(source, target)
+    names = [spec.name for spec in instances.specs]
+    groups = [sorted(group) for group in networkx.strongly_connected_components(graph)]
+    loops = [g for g in groups if len(g) > 1 or graph.has_edge(g[0], g[0])]
+    return tuple(tuple(names[k] for k in loop) for loop in sorted(loops))
+
+
+def _few(names: tuple[str, ...]) -> str:
+    if len(names) <= MANY:
+        return ", ".join(names)
+    return f"{', '.join(names[: MANY - 1])}, … ({len(names)} in all)"
