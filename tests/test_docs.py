@@ -22,39 +22,27 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def words(name):
-    return set(re.findall(r"[\w-]+", (ROOT / name).read_text(encoding="utf-8")))
+@pytest.fixture(scope="module")
+def generated():
+    return runpy.run_path(str(ROOT / "docs" / "generate.py"))
 
 
-@pytest.mark.parametrize(
-    "table",
-    [
-        tables.ScenarioTable,
-        tables.AgentTable,
-        tables.NetworkTable,
-        tables.PlantTable,
-        tables.Port,
-        tables.Override,
-        tables.LeaderTable,
-        tables.InitialTable,
-        tables.ChannelTable,
-        tables.ArcTable,
-        tables.ReportTable,
-        tables.SignalTable,
-        tables.Generated,
-        tables.ConnectionTable,
-        tables.ControlTable,
-        tables.CompareTable,
-        tables.CoolingTable,
-        tables.SetPointStep,
-        tables.Air,
-        tables.ScenarioFile,
-    ],
-    ids=lambda table: table.__name__,
-)
-def test_every_key_of_a_scenario_is_explained(table):
-    known = words("docs/scenario.md")
-    assert {a.name for a in attrs.fields(table)} <= known
+def test_every_key_of_a_scenario_is_explained(generated):
+    for table in generated["scenario_tables"]():
+        for key in table.keys:
+            assert key.meaning, (
+                f"say what {key.name!r} of {table.path} means: in the docstring of "
+                f"{table.place.__module__}.{table.place.__name__}, section Attributes"
+            )
+
+
+def test_the_page_of_keys_has_every_table_that_a_file_is_read_into(generated):
+    shown = {table.place for table in generated["scenario_tables"]()}
+    there = {c for c in vars(tables).values() if isinstance(c, type) and attrs.has(c)}
+    assert there - {tables.ScenarioFile} <= shown
+    paths = [table.path for table in generated["scenario_tables"]()]
+    for path in ("[plant]", "[[plant.override]]", "{variable = …}", "[signals.NAME]"):
+        assert path in paths
 
 
 def test_the_readme_lists_the_commands_that_work_and_no_others(capsys):
@@ -90,15 +78,11 @@ def test_links_of_the_documentation_lead_somewhere():
             assert link.startswith("http") or (page.parent / link).exists(), f"{page.name}: {link}"
 
 
-@pytest.fixture(scope="module")
-def generated():
-    return runpy.run_path(str(ROOT / "docs" / "generate.py"))
-
-
-@pytest.mark.parametrize("page", ["commands.md", "defects.md"])
-def test_pages_made_from_the_code_are_up_to_date(generated, page):
-    """If not: `python docs/generate.py`."""
-    assert generated["PAGES"][page]() == (ROOT / "docs" / page).read_text(encoding="utf-8")
+def test_pages_made_from_the_code_are_up_to_date(generated):
+    assert {"commands.md", "scenario_keys.md"} <= set(generated["PAGES"])
+    for page, make in generated["PAGES"].items():
+        stored = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        assert make() == stored, f"{page} is old: python docs/generate.py"
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/index.md", "docs/tutorial.md"])
@@ -142,3 +126,29 @@ def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     reference = "".join(p.read_text(encoding="utf-8") for p in (site / "api").glob("*.html"))
     for name in posmas_fmi.__all__:
         assert re.search(rf'id="posmas_fmi\.[\w.]*\b{name}"', reference), name
+
+
+def test_the_short_scenario_of_the_page_is_whole(tmp_path):
+    text = (ROOT / "docs" / "scenario.md").read_text(encoding="utf-8")
+    path = tmp_path / "tanks.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", text, re.S).group(1), encoding="utf-8")
+    assert posmas_fmi.load(path).network.N == 3
+
+
+@pytest.mark.parametrize("block", range(4))
+def test_the_tables_of_the_scenario_page_are_known(block, generated):
+    import tomllib
+
+    text = (ROOT / "docs" / "scenario.md").read_text(encoding="utf-8")
+    example = tomllib.loads(re.findall(r"```toml\n(.*?)```", text, re.S)[block])
+    keys = {
+        table.path.strip("[]").removesuffix(".NAME"): {key.name for key in table.keys}
+        for table in generated["scenario_tables"]()
+    }
+    for name, content in example.items():
+        tables_of = content if isinstance(content, list) else [content]
+        if name == "signals":
+            tables_of = list(content.values())
+        for table in tables_of:
+            below = {path.partition(".")[2] for path in keys if path.startswith(f"{name}.")}
+            assert set(table) <= keys[name] | below

@@ -11,14 +11,26 @@ Matrix = list[list[float]]
 
 @attrs.frozen
 class Uniform:
-    """Random initial values, alike likely in ``[low, high]`` = `uniform`, from the seed."""
+    """Random initial values from the seed.
+
+    Attributes
+    ----------
+    uniform : (float, float)
+        Least and largest; all between are alike likely.
+    """
 
     uniform: tuple[float, float]
 
 
 @attrs.frozen
 class Count:
-    """How many agents to pin; the design chooses which."""
+    """Pins that the design places.
+
+    Attributes
+    ----------
+    count : int
+        How many agents to pin.
+    """
 
     count: int
 
@@ -34,16 +46,18 @@ class ScenarioTable:
     until : float
         End of the run [s]; a multiple of `period`.
     period : float
-        Control period = communication step [s].
+        Control period = communication step [s], whole nanoseconds. Refused where an FMU does not
+        allow it, with the nearest that it allows.
     seed : int
         Of every random number of the run.
     tolerance : float
         Largest final error of an agent that counts as converged.
     engine : {"auto", "c", "numpy"}
         What runs the communication loop; auto: C where it can, else numpy. The results agree to
-        rounding.
+        1e-12.
     threads : int
-        Of the engine, if the FMUs allow it. The results do not depend on it.
+        Over which the C engine spreads the agents; not every exporter's FMU allows more than one.
+        The results do not depend on it.
     coupling : {"jacobi", "gauss-seidel", "iterate"}
         How FMUs that are connected step: all at once with readings of the last communication
         point; agents first, then each component with what those before it show by then; or all
@@ -62,7 +76,32 @@ class ScenarioTable:
 
 @attrs.frozen
 class AgentTable:
-    """``[agent]``: model (1); see `posmas_fmi.agent.Agent`."""
+    """``[agent]``: model (1), ``x' = A x + H g(t, x) + B sec(u)``, ``y = C x``.
+
+    There are m states, p inputs and q outputs.
+
+    Attributes
+    ----------
+    A : matrix
+        m×m, Metzler: no negative entry off the diagonal.
+    B : matrix
+        m×p, non-negative.
+    C : matrix
+        q×m.
+    H : matrix, optional
+        m×m, weights of g; default zero.
+    g : list of str, optional
+        m expressions in ``t, x1, …, xm``; default zero.
+    sec : list of str, optional
+        p expressions, the k-th in ``uk`` only; default ``uk``.
+    sector : (float, float)
+        ``[m_l, m_h]`` with ``m_l u² ≤ u sec(u) ≤ m_h u²``.
+    lipschitz : float or list of float, optional
+        Declared bound on the slopes of g, one number or m; default computed on `region`.
+    region : table
+        ``t``, ``x`` for all states, ``x1``, …, ``u``, ``u1``, … = ``[low, high]``; default
+        t, x ≥ 0 and all u.
+    """
 
     A: Matrix
     B: Matrix
@@ -84,15 +123,18 @@ class NetworkTable:
     agents : int, optional
         Number of agents, with `arcs`.
     arcs : list of [from, to] or [from, to, weight], optional
-        Agents are numbered from 1; "to" hears "from".
+        ``[from, to]`` or ``[from, to, weight]``: "to" hears "from". Agents are numbered from 1.
     file : str, optional
-        ``.csv``, ``.mtx`` or ``.graphml``, instead of `arcs`.
+        Instead of `arcs`: ``.csv`` (header ``from,to`` or ``from,to,weight``), ``.mtx`` (row i
+        lists whom agent i hears) or ``.graphml``, beside the scenario file.
     ring : list of int, optional
         Instead of `arcs`: agent i hears the agents i - k of a ring, for each k listed.
     pinned : list of int, "auto" or {count = k}
+        The agents that hear the leader; or chosen by the design: the best one, or k of them.
     pin_weight : float
         Weight of the arcs from the leader.
     names : list of str, optional
+        Of the agents, for report and errors.
     """
 
     pinned: list[int] | Literal["auto"] | Count
@@ -111,6 +153,7 @@ class Port:
     Attributes
     ----------
     variable : str
+        Name in the FMU, or an element of an array, ``u[1]``.
     scale, offset : float
         FMU value = scale × protocol value + offset.
     unit : str, optional
@@ -130,7 +173,9 @@ class Override:
     Attributes
     ----------
     agent : int
+        Which one.
     fmu : str, optional
+        Another FMU.
     parameters : table
         Besides those of ``[plant]``.
     inputs, outputs, states : table, optional
@@ -161,14 +206,15 @@ class PlantTable:
     inputs, outputs, states : table
         ``u1 = "u[1]"`` or ``u1 = {variable = "u[1]", scale = 1.0, offset = 0.0, unit = "W"}``.
     parameters : table
-        Start values by name.
+        Start values by name. Those that the FMU does not let one set, or changes, are told and
+        stand in ``manifest.json`` under ``start_values``.
     exogenous : table
         FMU input = "name of a signal".
     measured : table
         What the controllers measure beside y, ``name = "signal"``, ``"VARIABLE"`` of the agent's
         FMU or ``"component.VARIABLE"``; which names there are, the control law says.
     record : list of str
-        FMU variables that are recorded besides.
+        FMU variables that are recorded in ``results.nc`` besides.
     tolerance : float, optional
         Relative, for the solver inside the FMU.
     """
@@ -251,6 +297,7 @@ class ComponentTable:
     Attributes
     ----------
     name : str
+        Of the component: what is recorded of it is ``name.variable`` in ``results.nc``.
     fmu : str
         As in ``[plant]``.
     fmi : int
@@ -357,7 +404,15 @@ class FaultTable:
 
 @attrs.frozen
 class JumpTable:
-    """``[[leader.jump]]``: at a time [s] the leader goes on from another state."""
+    """``[[leader.jump]]``: the leader goes on from another state.
+
+    Attributes
+    ----------
+    at : float
+        When [s].
+    s : list of float
+        That state.
+    """
 
     at: float
     s: list[float]
@@ -370,6 +425,7 @@ class LeaderTable:
     Attributes
     ----------
     s0 : list of float
+        Initial state, non-negative.
     jump : list of JumpTable
     """
 
@@ -396,7 +452,15 @@ class InitialTable:
 
 @attrs.frozen
 class ArcTable:
-    """``[[channel.arc]]``: a single arc, by agent numbers from 1; 0 is the leader."""
+    """``[[channel.arc]]``: what is different on a single arc.
+
+    Attributes
+    ----------
+    arc : (int, int)
+        ``[from, to]``, by agent numbers from 1; 0 is the leader.
+    delay, jitter, loss : float
+        As in ``[channel]``.
+    """
 
     arc: tuple[int, int]
     delay: float = 0.0
@@ -465,7 +529,15 @@ class CompareTable:
 
 @attrs.frozen
 class SetPointStep:
-    """``set_point_step``: from a time `at` [s] on the set-point is `to` [K above the water]."""
+    """``set_point_step``: another set-point from a time on.
+
+    Attributes
+    ----------
+    at : float
+        From when on [s].
+    to : float
+        Supply temperature above `facility` [K].
+    """
 
     at: float
     to: float
@@ -473,7 +545,15 @@ class SetPointStep:
 
 @attrs.frozen
 class Air:
-    """``air``: temperature [K] and relative humidity of the room, for the dew point."""
+    """``air``: the air of the room, for the dew point.
+
+    Attributes
+    ----------
+    temperature : float
+        [K]
+    humidity : float
+        Relative, 0 to 1.
+    """
 
     temperature: float
     humidity: float
@@ -513,6 +593,7 @@ class CoolingTable:
     set_point : float, optional
         Supply temperature above `facility` [K]; default 5.
     set_point_step : table, optional
+        Another set-point from a time on.
     band : float
         Around the set-point that is to be kept [K].
     """
@@ -536,7 +617,13 @@ class CoolingTable:
 
 @attrs.frozen
 class ReportTable:
-    """``[report]``: whether the run without control is made as well, for comparison."""
+    """``[report]``: what the report shows.
+
+    Attributes
+    ----------
+    baseline : bool
+        Whether the run without control (K = 0) is made as well, for comparison.
+    """
 
     baseline: bool = True
 
