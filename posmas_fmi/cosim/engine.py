@@ -487,8 +487,11 @@ class Engine:
             self._take(record)
         time_now = self._system.clock.time(self._e.k)
         if self._e.ended == _FAILED:
-            error = self._plant.fmus.error(self._reports[0].failure, time_now)
-            ended, reason, agent = "failed", str(error), error.agent
+            try:
+                error = self._plant.fmus.error(self._reports[0].failure, time_now)
+                ended, reason, agent = "failed", str(error), error.agent
+            except KeyboardInterrupt:  # during a call that goes through Python
+                ended, reason = "cancelled", "interrupted"
         elif self._e.ended == _DIVERGED:
             agent, reason = self._diverged()
             ended = "diverged"

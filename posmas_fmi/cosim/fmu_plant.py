@@ -20,6 +20,7 @@ from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
+from posmas_fmi.fmu.open import open_fmu
 from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
 from posmas_fmi.fmu.units import Conversion
 
@@ -92,7 +93,7 @@ class FmuPlant:
         messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
             paths = dict.fromkeys(spec.fmu for spec in specs)
-            files = {path: stack.enter_context(FmuFile(path, messages)) for path in paths}
+            files = {path: stack.enter_context(open_fmu(path, messages)) for path in paths}
             known = {
                 (fmu, ports): converted(files[fmu].about, ports)
                 for fmu, ports in dict.fromkeys(

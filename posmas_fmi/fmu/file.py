@@ -68,6 +68,7 @@ class FmuFile:
     """
 
     kind: Kind = "Co-Simulation"
+    events = False  # whether its instances use Event Mode and may return early
 
     def __init__(
         self,
@@ -222,7 +223,7 @@ class FmuFile:
             arguments = (
                 *(text, token, self._resources),
                 *(False, False),  # neither visible nor debug logging
-                *(False, False, None, 0),  # no event mode, early return, intermediate variables
+                *(self.events, self.events, None, 0),  # event mode, early return; no variables
                 *(self._messages.environment(key), callbacks, fmi3IntermediateUpdateCallback()),
             )
             function = "fmi3InstantiateCoSimulation"

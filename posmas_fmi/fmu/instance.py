@@ -54,10 +54,13 @@ class Step:
         [s]
     early : bool
         Whether that is before the end that was asked for.
+    event : bool
+        Whether the FMU asks for Event Mode.
     """
 
     reached: float
     early: bool = False
+    event: bool = False
 
 
 class FmuInstance:
@@ -116,7 +119,13 @@ class FmuInstance:
         """What the instance logged during the last call, the last few lines."""
         return tuple(self.file._messages.of(self.key))
 
-    def _call(self, function: str, *arguments: Any) -> None:
+    def call(self, function: str, *arguments: Any) -> None:
+        """Call a function of the FMI, named without its prefix, and check the status.
+
+        Raises
+        ------
+        FmuCallError
+        """
         if self.key not in self.file._live:
             raise self.error(function, "the instance was freed")
         self.file._messages.forget(self.key)
@@ -206,14 +215,14 @@ class FmuInstance:
         experiment = (*tolerances, start, stop is not None, stop or 0.0)
         self.time = start
         if self.file.version == 2:
-            self._call("SetupExperiment", *experiment)
-            self._call("EnterInitializationMode")
+            self.call("SetupExperiment", *experiment)
+            self.call("EnterInitializationMode")
         else:
-            self._call("EnterInitializationMode", *experiment)
+            self.call("EnterInitializationMode", *experiment)
 
     def exit_initialization(self) -> None:
         """Leave Initialization Mode; the first step may follow."""
-        self._call("ExitInitializationMode")
+        self.call("ExitInitializationMode")
 
     def do_step(self, time: float, step: float) -> None:
         """Advance from `time` by `step` [s].
@@ -247,23 +256,23 @@ class FmuInstance:
             Also if the FMU asks to end the simulation.
         """
         if self.file.version == 2:
-            self._call("DoStep", time, step, 0)
+            self.call("DoStep", time, step, 0)
             return Step(time + step)
         event, terminate, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
         last = ctypes.c_double(time)
         by = ctypes.byref
-        self._call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
+        self.call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
         if terminate.value:
             raise self.ended_early(True, last.value)
-        return Step(last.value if early.value else time + step, early.value)
+        return Step(last.value if early.value else time + step, early.value, event.value)
 
     def terminate(self) -> None:
         """End the simulation; values may still be read."""
-        self._call("Terminate")
+        self.call("Terminate")
 
     def reset(self) -> None:
         """Go back to the state after instantiation."""
-        self._call("Reset")
+        self.call("Reset")
         self.time = 0.0
 
     # ---- values ---------------------------------------------------------------------------------
@@ -320,7 +329,7 @@ class FmuInstance:
     def _transfer(self, direction: str, group: Group, values: np.ndarray[Any, Any]) -> None:
         count = (group.size,) if self.file.version == 3 else ()
         references = group.references
-        self._call(direction + group.kind, references, len(references), pointer(values), *count)
+        self.call(direction + group.kind, references, len(references), pointer(values), *count)
 
     def get(self, name: str) -> Any:
         """Return a value by name: a float, an int, a str, or an array of the variable's shape."""
@@ -369,7 +378,7 @@ class FmuInstance:
     def _get_text(self, variable: Variable) -> str:
         found = (ctypes.c_char_p * 1)()
         count = (1,) if self.file.version == 3 else ()
-        self._call("GetString", (ctypes.c_uint * 1)(variable.reference), 1, found, *count)
+        self.call("GetString", (ctypes.c_uint * 1)(variable.reference), 1, found, *count)
         return (found[0] or b"").decode("utf-8", "replace")
 
     def _set_text(self, variable: Variable, value: Any) -> None:
@@ -377,28 +386,28 @@ class FmuInstance:
             raise FmuError(f"expected a text for {variable.name!r} (got {value!r})", self.name)
         texts = (ctypes.c_char_p * 1)(value.encode())
         count = (1,) if self.file.version == 3 else ()
-        self._call("SetString", (ctypes.c_uint * 1)(variable.reference), 1, texts, *count)
+        self.call("SetString", (ctypes.c_uint * 1)(variable.reference), 1, texts, *count)
 
     # ---- state ----------------------------------------------------------------------------------
 
     def get_state(self) -> FmuState:
         """Save the whole state of the instance."""
         handle = ctypes.c_void_p()
-        self._call(f"Get{self._state}", ctypes.byref(handle))
+        self.call(f"Get{self._state}", ctypes.byref(handle))
         return FmuState(self, handle, self.time)
 
     def set_state(self, state: FmuState) -> None:
         """Go back to a state saved from this instance."""
-        self._call(f"Set{self._state}", state.handle)
+        self.call(f"Set{self._state}", state.handle)
         self.time = state.time
 
     def serialise(self) -> bytes:
         """Return the whole state as bytes, which `deserialise` takes, also in another process."""
         size = ctypes.c_size_t()
         with self.get_state() as state:
-            self._call(f"Serialized{self._state}Size", state.handle, ctypes.byref(size))
+            self.call(f"Serialized{self._state}Size", state.handle, ctypes.byref(size))
             buffer = ctypes.create_string_buffer(size.value)
-            self._call(f"Serialize{self._state}", state.handle, self._bytes(buffer), size.value)
+            self.call(f"Serialize{self._state}", state.handle, self._bytes(buffer), size.value)
             return buffer.raw
 
     def deserialise(self, data: bytes, time: float) -> None:
@@ -414,7 +423,7 @@ class FmuInstance:
         handle = ctypes.c_void_p()
         buffer = ctypes.create_string_buffer(data, max(len(data), 1))
         word = "DeSerializeFMUstate" if self.file.version == 2 else "DeserializeFMUState"
-        self._call(word, self._bytes(buffer), len(data), ctypes.byref(handle))
+        self.call(word, self._bytes(buffer), len(data), ctypes.byref(handle))
         with FmuState(self, handle, time) as state:
             self.set_state(state)
 
@@ -450,5 +459,5 @@ class FmuInstance:
             arguments += [pointer(direction), pointer(result)]
         else:
             arguments += [pointer(direction), by.size, pointer(result), of.size]
-        self._call("GetDirectionalDerivative", *arguments)
+        self.call("GetDirectionalDerivative", *arguments)
         return np.asarray(result[of.places])

@@ -7,16 +7,15 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.events import EventInfo, settle, update_discrete_states
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import pointer
 
-_MOST_ITERATIONS = 100  # of the discrete states at one event
 _MOST_EVENTS = 10_000  # on the way to one point in time
 _EVENT_WIDTH = 1e-12  # relative: how closely a state event is located
 
@@ -66,27 +65,6 @@ class ModelExchangeFile(FmuFile):
         return made
 
 
-@attrs.frozen
-class EventInfo:
-    """What an FMU says at an event.
-
-    Attributes
-    ----------
-    again : bool
-        Whether the discrete states need another update.
-    terminate : bool
-    nominals_changed, states_changed : bool
-    next_event : float
-        Time of the next time event [s]; inf if none is known.
-    """
-
-    again: bool
-    terminate: bool
-    nominals_changed: bool
-    states_changed: bool
-    next_event: float
-
-
 class ModelExchangeInstance(FmuInstance):
     """One Model Exchange instance; made by `ModelExchangeFile.instantiate`.
 
@@ -124,52 +102,22 @@ class ModelExchangeInstance(FmuInstance):
 
     def handle_event(self) -> None:
         """Go through Event Mode and back to Continuous-Time Mode."""
-        self._call("EnterEventMode")
+        self.call("EnterEventMode")
         self._settle()
 
     def _settle(self) -> None:
-        for _ in range(_MOST_ITERATIONS):
-            info = self.update_discrete_states()
-            if info.terminate:
-                raise self.error(self._update, "asked to end the simulation")
-            if not info.again:
-                self.next_event = info.next_event
-                self._call("EnterContinuousTimeMode")
-                return
-        raise self.error(
-            self._update, f"the discrete states did not settle in {_MOST_ITERATIONS} updates"
-        )
-
-    @property
-    def _update(self) -> str:
-        return "NewDiscreteStates" if self.file.version == 2 else "UpdateDiscreteStates"
+        self.next_event = settle(self)
+        self.call("EnterContinuousTimeMode")
 
     def update_discrete_states(self) -> EventInfo:
         """In Event Mode: update the discrete states once."""
-        by = ctypes.byref
-        if self.file.version == 2:
-            from fmpy.fmi2 import fmi2EventInfo
-
-            info = fmi2EventInfo()
-            self._call(self._update, by(info))
-            return EventInfo(
-                bool(info.newDiscreteStatesNeeded),
-                bool(info.terminateSimulation),
-                bool(info.nominalsOfContinuousStatesChanged),
-                bool(info.valuesOfContinuousStatesChanged),
-                float(info.nextEventTime) if info.nextEventTimeDefined else math.inf,
-            )
-        flags = [ctypes.c_bool() for _ in range(5)]
-        time = ctypes.c_double()
-        self._call(self._update, *map(by, flags), by(time))
-        again, terminate, nominals, states, defined = (flag.value for flag in flags)
-        return EventInfo(again, terminate, nominals, states, time.value if defined else math.inf)
+        return update_discrete_states(self)
 
     # ---- values ---------------------------------------------------------------------------------
 
     def set_time(self, time: float) -> None:
         """Set the independent variable [s]."""
-        self._call("SetTime", time)
+        self.call("SetTime", time)
         self.time = time
 
     def set_states(self, x: ArrayLike) -> None:
@@ -180,7 +128,7 @@ class ModelExchangeInstance(FmuInstance):
                 "SetContinuousStates", f"expected {self.n_states} states (got {values.size})"
             )
         if values.size:
-            self._call("SetContinuousStates", pointer(values), values.size)
+            self.call("SetContinuousStates", pointer(values), values.size)
 
     def states(self) -> Array:
         """Return the continuous states, (n_states,)."""
@@ -203,7 +151,7 @@ class ModelExchangeInstance(FmuInstance):
     def _vector(self, function: str, size: int) -> Array:
         values = np.full(size, np.nan)
         if size:
-            self._call(function, pointer(values), size)
+            self.call(function, pointer(values), size)
         if not np.isfinite(values).all():
             k = int(np.flatnonzero(~np.isfinite(values))[0])
             raise self.error(function, f"value {k + 1} is not finite ({values[k]:g})")
@@ -232,7 +180,7 @@ class ModelExchangeInstance(FmuInstance):
             due = self.next_event <= self.time * (1 + _EVENT_WIDTH)
             if due or self._integrate(min(until, self.next_event), rtol):
                 self.handle_event()
-        raise self.error(self._update, f"more than {_MOST_EVENTS} events before {until:g} s")
+        raise self.error("DoStep", f"more than {_MOST_EVENTS} events before {until:g} s")
 
     def _integrate(self, until: float, rtol: float) -> bool:
         """Integrate up to a time or to the first event before it; return whether there is one."""
@@ -287,7 +235,7 @@ class ModelExchangeInstance(FmuInstance):
         kind = ctypes.c_int if self.file.version == 2 else ctypes.c_bool
         event, terminate = kind(), kind()
         by = ctypes.byref
-        self._call("CompletedIntegratorStep", True, by(event), by(terminate))
+        self.call("CompletedIntegratorStep", True, by(event), by(terminate))
         if terminate.value:
             raise self.error("CompletedIntegratorStep", "asked to end the simulation")
         return bool(event.value)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from posmas_fmi.fmu.live import free_state
 
@@ -14,11 +14,20 @@ if TYPE_CHECKING:
 
 
 class FmuState:
-    """A saved state of one instance; freed by `free`, a ``with`` block, or with the instance."""
+    """A saved state of one instance; freed by `free`, a ``with`` block, or with the instance.
+
+    Attributes
+    ----------
+    time : float
+        Of the instance then [s].
+    beside : object
+        What the instance keeps outside the FMU.
+    """
 
     def __init__(self, instance: FmuInstance, handle: ctypes.c_void_p, time: float) -> None:
         self.handle = handle
         self.time = time
+        self.beside: Any = None
         live = instance._live
         live.states[id(handle)] = handle
         self._free = weakref.finalize(self, free_state, live, handle, instance.file._frees)

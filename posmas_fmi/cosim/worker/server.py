@@ -20,7 +20,9 @@ from posmas_fmi.cosim.fmus import Fmus, NativeMessages, PortMap
 from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import Limits, Minder, bound
 from posmas_fmi.errors import FmuCallError, PosmasError
-from posmas_fmi.fmu.instance import FmuFile, FmuInstance
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.open import open_fmu
 
 Answer = tuple[Any, bytes]
 
@@ -123,7 +125,7 @@ class Server:
     def _do_load(self, request: frames.Frame) -> Answer:
         path, unpacked = request.content["path"], request.content["unpacked"]
         if path not in self._files:
-            self._files[path] = FmuFile(path, self._messages, self._trace, Path(unpacked))
+            self._files[path] = open_fmu(path, self._messages, self._trace, Path(unpacked))
         return None, b""
 
     def _do_instantiate(self, request: frames.Frame) -> Answer:

@@ -1,0 +1,41 @@
+"""Opening an FMU by what it offers: Co-Simulation, else Model Exchange through an integrator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from posmas_fmi.errors import FmuError
+from posmas_fmi.fmu.about import read_about
+from posmas_fmi.fmu.binding import Trace
+from posmas_fmi.fmu.callbacks import Messages
+from posmas_fmi.fmu.event_mode import EventFile, needs_event_mode
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.stepped import SteppedFile
+
+
+def open_fmu(
+    path: str | Path,
+    messages: Messages | None = None,
+    trace: Trace | None = None,
+    unpacked: Path | None = None,
+) -> FmuFile:
+    """Open an FMU whose instances take communication steps; parameters as `FmuFile`.
+
+    Raises
+    ------
+    ArchiveError
+        If the file cannot be unpacked or its description not be read.
+    FmuError
+        If it is for Scheduled Execution only, or has no binary that loads here.
+    """
+    about = read_about(Path(path))
+    if about.interface is None:
+        raise FmuError(
+            "expected an interface for Co-Simulation or Model Exchange (it has Scheduled Execution "
+            "only, which is not run)",
+            str(path),
+        )
+    kind: type[FmuFile] = FmuFile if about.kind == "Co-Simulation" else SteppedFile
+    if needs_event_mode(about):
+        kind = EventFile
+    return kind(path, messages, trace, unpacked)
