@@ -31,6 +31,7 @@ from posmas_fmi.cosim.master import (
     simulate,
 )
 from posmas_fmi.cosim.plant import Plant
+from posmas_fmi.cosim.snapshot import Snapshot, arrivals_state, set_arrivals
 from posmas_fmi.errors import BuildError, InputError
 from posmas_fmi.expression import Array
 
@@ -41,6 +42,10 @@ RecordBlock = Callable[[Array, dict[str, Array]], None]  # times (r,), arrays (r
 
 SLICE = 0.05  # s of wall time between returns to Python: how long Ctrl-C may take
 BLOCK = 4_000_000  # bytes of rows that are kept until the slice ends
+STATE = (  # what a snapshot keeps of the engine's memory
+    *("memory", "pending", "message", "readings", "measured", "u", "applied", "actuated"),
+    *("inputs", "frozen", "min_state", "min_time", "held", "sent_at"),
+)
 VARIABLES = ("x", "xhat", "u", "sec_u", "y", "s", "measured", "extra")
 
 
@@ -132,6 +137,7 @@ def run(
     choice: Choice | None = None,
     threads: int = 1,
     variables: tuple[str, ...] = VARIABLES,
+    snapshots: Snapshots | None = None,
 ) -> Outcome:
     """Run the sampled loop; the same as `posmas_fmi.cosim.master.simulate`, faster.
 
@@ -151,6 +157,9 @@ def run(
         Of the engine. The FMUs must allow it; the results are the same bit for bit.
     variables : tuple of str
         What to record.
+    snapshots : Snapshots, optional
+        Where to begin, and what to do with snapshots. The numpy loop has none: it does all again
+        from the start and records from the snapshot on.
 
     Returns
     -------
@@ -160,13 +169,38 @@ def run(
     if choice.engine == "c" and not isinstance(plant, FmuPlant):
         choice = _fall_back(f"the engine steps FMUs (the plant is a {type(plant).__name__})")
     if choice.engine == "numpy":
-        return simulate(system, plant, _by_row(record, variables), progress)
+        begin = snapshots.start.k if snapshots is not None and snapshots.start else 0
+        return simulate(
+            system, plant, _by_row(record, variables, system.clock.time(begin)), progress
+        )
     assert isinstance(plant, FmuPlant)
     assert choice.library is not None
     library = native.load(choice.library)
-    return Engine(system, plant, library, threads, variables if record else ()).run(
-        record, progress
-    )
+    one = Engine(system, plant, library, threads, variables if record else ())
+    if snapshots is not None:
+        if snapshots.every:
+            one.keep_snapshots(snapshots.every, snapshots.keep)
+        if snapshots.start is not None:
+            one.start_from(snapshots.start)
+    return one.run(record, progress)
+
+
+@attrs.frozen(eq=False)
+class Snapshots:
+    """Where a run begins, and what is done with its snapshots.
+
+    Attributes
+    ----------
+    start : Snapshot, optional
+    every : int
+        Communication steps between snapshots; 0: none.
+    keep : callable
+        Gets each of them.
+    """
+
+    start: Snapshot | None = None
+    every: int = 0
+    keep: Callable[[Snapshot], None] = lambda snapshot: None
 
 
 def unfit(system: System) -> str:
@@ -176,11 +210,15 @@ def unfit(system: System) -> str:
     return ""
 
 
-def _by_row(record: RecordBlock | None, variables: tuple[str, ...]) -> Record | None:
+def _by_row(
+    record: RecordBlock | None, variables: tuple[str, ...], begin: float = 0.0
+) -> Record | None:
     if record is None:
         return None
 
     def row(t: float, values: dict[str, Array]) -> None:
+        if t < begin:
+            return
         chosen = {name: value[None] for name, value in values.items() if name in variables}
         record(np.array([t]), chosen)
 
@@ -307,6 +345,9 @@ class Engine:
         self._conditions = system.timeline.at(0)
         self._incidents: Any = None
         self._happened: list[Incident] = []
+        self._start: Snapshot | None = None
+        self._checkpoint: Callable[[Snapshot], None] | None = None
+        self._checkpoint_every = 0
         self._largest_initial = 0.0
         self._threads = max(1, min(threads, system.network.N, int(library.engine_threads())))
         self._define(library)
@@ -480,7 +521,10 @@ class Engine:
         ended: Any = "complete"
         reason = agent = ""
         try:
-            self._begin()
+            if self._start is None:
+                self._begin()
+            else:
+                self._go_on_from(self._start)
             self._slices(record, progress)
         except KeyboardInterrupt:
             ended, reason = "cancelled", "interrupted"
@@ -530,16 +574,90 @@ class Engine:
             loss = self._conditions.loss if self._draws_loss else None
             self._point("arrivals", self._arrivals.draw(begin, end, loss), np.int32)
 
-    def _slices(self, record: RecordBlock | None, progress: Progress | None) -> None:
+    # ---- snapshots ------------------------------------------------------------------------------
+
+    def keep_snapshots(self, every: int, keep: Callable[[Snapshot], None]) -> None:
+        """Hand over a snapshot after so many communication steps, again and again."""
+        self._checkpoint_every, self._checkpoint = every, keep
+
+    def start_from(self, snapshot: Snapshot) -> None:
+        """Begin there instead of at the start; the plant must be as it is at the start.
+
+        Raises
+        ------
+        InputError
+            If the snapshot is of another system.
+        """
+        known = {name: self._keep[name] for name in STATE if name in self._keep}
+        for name, array in snapshot.arrays.items():
+            if name in known and known[name].shape != array.shape:
+                raise InputError(
+                    f"the snapshot is of another system: {name} has the shape {array.shape}, here "
+                    f"{known[name].shape}"
+                )
+        if snapshot.fmus is not None and len(snapshot.fmus) != len(self._plant.fmus):
+            raise InputError("the snapshot has another number of FMUs")
+        self._start = snapshot
+
+    def snapshot(self) -> Snapshot:
+        """Return all state at the communication point that comes next."""
+        counts: dict[str, Any] = {
+            "limit": float(self._e.limit),
+            "largest_initial": self._largest_initial,
+            "observed": self._observed,
+            "sent": self._sent,
+            "lost": self._lost,
+        }
+        if self._arrivals is not None:
+            counts["arrivals"] = arrivals_state(self._arrivals)
+        arrays = {name: self._keep[name].copy() for name in STATE if name in self._keep}
+        return Snapshot(int(self._e.k), arrays, counts, self._plant.serialise())
+
+    def _go_on_from(self, snapshot: Snapshot) -> None:
+        k, counts = snapshot.k, snapshot.counts
+        if snapshot.fmus is None:  # bring the FMUs there by doing all that was done before
+            self._begin()
+            self._slices(None, None, stop=k)
+            self._pending = False
+            self._compare(snapshot)
+            return
+        self._plant.deserialise(snapshot.fmus, self._system.clock.time(k))
+        for name, array in snapshot.arrays.items():
+            if name in self._keep:
+                self._keep[name][...] = array
+            else:
+                self._point(name, array, array.dtype)
+        self._e.k, self._e.ready, self._e.limit = k, 1, counts["limit"]
+        self._largest_initial, self._observed = counts["largest_initial"], counts["observed"]
+        self._sent, self._lost = counts["sent"], counts["lost"]
+        if self._arrivals is not None:
+            set_arrivals(self._arrivals, counts["arrivals"])
+        self._set_conditions(max(k - 1, 0))
+
+    def _compare(self, snapshot: Snapshot) -> None:
+        """Say by how much a run that was done again differs from what it was."""
+        pairs = [(self._keep[n], a) for n, a in snapshot.arrays.items() if n in self._keep]
+        worst = max((float(np.abs(a - b).max(initial=0.0)) for a, b in pairs), default=0.0)
+        if worst > 0:
+            log.warning("run again, the FMUs do not repeat themselves: up to %.2g apart", worst)
+
+    def _slices(
+        self, record: RecordBlock | None, progress: Progress | None, stop: int | None = None
+    ) -> None:
         e, clock = self._e, self._system.clock
-        length, change = 1, self._system.next_change(0)
-        while e.ended == _GOES_ON and not self._halted:
+        length, change = 1, self._system.next_change(max(e.k - 1, 0))
+        while e.ended == _GOES_ON and not self._halted and e.k != stop:
             if e.k == change:
                 self._set_conditions(e.k)
                 e.ready, change = 2, self._system.next_change(e.k)
             bounded = self._rows or self._arrivals or e.drives or self._noise
             room = min(length, self._room) if bounded else length
             e.until = min(e.k + room, clock.steps + 1, change)
+            if stop is not None:
+                e.until = min(e.until, stop)
+            every = self._checkpoint_every
+            if every:
+                e.until = min(e.until, (e.k // every + 1) * every)
             self._feed(e.k, e.until)
             began = time.perf_counter()
             self._call()
@@ -547,6 +665,9 @@ class Engine:
             self._take(record)
             if progress is not None:
                 progress(e.k, clock.steps)
+            due = every and e.k % every == 0 and stop is None
+            if due and e.ended == _GOES_ON and self._checkpoint is not None:
+                self._checkpoint(self.snapshot())
             length = int(min(2 * length, max(1, length * SLICE / max(took, 1e-6))))
 
     def _call(self) -> None:

@@ -187,6 +187,31 @@ class FmuPlant:
         """
         return [(number, self._instances[number].get_state()) for number in which]
 
+    def serialise(self) -> tuple[bytes, ...] | None:
+        """Return the states of all instances as bytes; None if an FMU cannot give its own."""
+        for file in dict.fromkeys(instance.file for instance in self._instances):
+            interface = file.description.coSimulation
+            if file.kind != "Co-Simulation" or not (
+                interface.canGetAndSetFMUstate and interface.canSerializeFMUstate
+            ):
+                return None
+        try:
+            return tuple(instance.serialise() for instance in self._instances)
+        except FmuError as error:
+            log.warning("an FMU that says it can does not give its state: %s", error)
+            return None
+
+    def deserialise(self, states: tuple[bytes, ...], time: float) -> None:
+        """Bring all instances to states that `serialise` returned, at a time [s].
+
+        Raises
+        ------
+        FmuCallError
+            If an FMU refuses.
+        """
+        for instance, data in zip(self._instances, states, strict=True):
+            instance.deserialise(data, time)
+
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
         for number, state in saved:

@@ -1,0 +1,109 @@
+"""A snapshot of a whole run: controllers, messages, channel and FMUs, to go on from there."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+
+from posmas_fmi.cosim.channel import Arrivals
+from posmas_fmi.errors import InputError
+from posmas_fmi.expression import Array
+
+
+@attrs.frozen(eq=False)
+class Snapshot:
+    """All state of a run at a communication point.
+
+    Attributes
+    ----------
+    k : int
+        The communication point: steps done.
+    arrays : dict of str to array
+        Of the engine.
+    counts : dict
+        Figures of the outcome so far, and the state of the random numbers.
+    fmus : tuple of bytes or None
+        Serialised FMU states, one per instance; None where one of them cannot give it: then the
+        FMUs are brought there by running again from the start.
+    """
+
+    k: int
+    arrays: dict[str, Array]
+    counts: dict[str, Any]
+    fmus: tuple[bytes, ...] | None
+
+    def save(self, path: Path) -> None:
+        """Write it to one file; it is there whole or not at all.
+
+        Parameters
+        ----------
+        path : Path
+            Ending in ``.npz``.
+        """
+        facts = {"k": self.k, "counts": self.counts, "serialised": self.fmus is not None}
+        content: dict[str, Any] = {f"array_{name}": value for name, value in self.arrays.items()}
+        for number, data in enumerate(self.fmus or ()):
+            content[f"fmu_{number}"] = np.frombuffer(data, dtype=np.uint8)
+        content["facts"] = np.frombuffer(json.dumps(facts).encode(), dtype=np.uint8)
+        partial = path.with_suffix(".partial.npz")
+        with partial.open("wb") as file:
+            np.savez(file, **content)
+        os.replace(partial, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Snapshot:
+        """Read it back.
+
+        Raises
+        ------
+        InputError
+            If the file is not a snapshot.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                facts = json.loads(content["facts"].tobytes())
+                names = [name for name in content.files if name.startswith("array_")]
+                arrays = {name.removeprefix("array_"): content[name] for name in names}
+                count = sum(name.startswith("fmu_") for name in content.files)
+                states = tuple(content[f"fmu_{k}"].tobytes() for k in range(count))
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise InputError(f"this is not a snapshot of a run: {error}", str(path)) from None
+        return cls(facts["k"], arrays, facts["counts"], states if facts["serialised"] else None)
+
+
+def arrivals_state(arrivals: Arrivals) -> dict[str, Any]:
+    """Return what is under way in a channel, for JSON."""
+    due = [
+        [when, sent_at, [int(arc) for arc in arcs]]
+        for when, entries in arrivals._due.items()
+        for arcs, sent_at in entries
+    ]
+    return {
+        "random": arrivals.random.bit_generator.state,
+        "stamp": [int(value) for value in arrivals._stamp],
+        "due": due,
+    }
+
+
+def set_arrivals(arrivals: Arrivals, state: dict[str, Any]) -> None:
+    """Go back to what `arrivals_state` returned."""
+    arrivals.random.bit_generator.state = state["random"]
+    arrivals._stamp[:] = state["stamp"]
+    arrivals._due.clear()
+    for when, sent_at, arcs in state["due"]:
+        arrivals._due.setdefault(when, []).append((np.array(arcs, dtype=np.intp), sent_at))
+
+
+def newest(folder: Path, at_most: int) -> Path | None:
+    """Return the file of the last snapshot in a folder at or before a communication point."""
+    found = [
+        (int(path.stem), path)
+        for path in folder.glob("*.npz")
+        if path.stem.isdigit() and int(path.stem) <= at_most
+    ]
+    return max(found, default=(0, None))[1]
