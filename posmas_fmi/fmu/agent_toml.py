@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from posmas_fmi.fmu.evaluation import Values
     from posmas_fmi.fmu.fit import FittedAgent
+    from posmas_fmi.fmu.linearise import Linearisation
 
 
 def agent_toml(fitted: FittedAgent) -> str:
@@ -26,24 +30,42 @@ def agent_toml(fitted: FittedAgent) -> str:
         lines.append(f"lipschitz = {declared!r}")
     lines += ["", "[agent.region]"]
     lines += [f"{name} = {[float(v) for v in pair]!r}" for name, pair in agent.region.items()]
-    lines += ["", "[plant]", f"fmu = {json.dumps(fitted.path.name)}"]
-    scale = fitted.input_scale
+    turned = fitted.input_scale.tolist()
+    return "\n".join(lines) + "\n\n" + plant_toml(fitted.path, made, fitted.values, turned)
+
+
+def plant_toml(
+    path: Path, made: Linearisation, values: Values, input_scale: Sequence[float] | None = None
+) -> str:
+    """Return the ``[plant]`` section: ports in deviations from the operating point.
+
+    Parameters
+    ----------
+    path : Path
+        Of the FMU; only its name is written.
+    made : Linearisation
+    values : mapping
+        Parameters that it is given.
+    input_scale : sequence of float, optional
+        Of each input; 1 by default.
+    """
+    lines = ["[plant]", f"fmu = {json.dumps(path.name)}"]
     for kind, letter, names, offset in (
         ("inputs", "u", made.inputs, made.u0),
         ("outputs", "y", made.outputs, made.y0),
-        ("states", "x", made.states, made.x0),
+        ("states", "x", made.states if made.named else (), made.x0),
     ):
-        lines += ["", f"[plant.{kind}]"]
+        lines += ["", f"[plant.{kind}]"] if names else []
         for k, name in enumerate(names):
-            factor = float(scale[k]) if letter == "u" else 1.0
+            factor = float(input_scale[k]) if input_scale and letter == "u" else 1.0
             port = f"variable = {json.dumps(name)}, scale = {factor!r}"
             port += f", offset = {float(offset[k])!r}"
             lines.append(f"{letter}{k + 1} = {{ {port} }}")
-    if fitted.values:
+    if values:
         lines += ["", "[plant.parameters]"]
         lines += [
             f"{json.dumps(name)} = {np.asarray(value, dtype=float).tolist()!r}"
-            for name, value in fitted.values.items()
+            for name, value in values.items()
         ]
     return "\n".join(lines) + "\n"
 

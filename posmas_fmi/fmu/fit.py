@@ -208,17 +208,41 @@ def fit_agent(
     with open_fmu(path, interface) as file:
         names = signals(file, inputs, outputs, states)
         check_values(file, values)
-        made, f = _linearised(file, names, at, values)
-        notes = []
-        if region is None:
-            region = _around(file, made)
-            notes.append(
-                "no region was given: a tenth of each variable's size either side was taken; "
-                "give the range where the plant works"
-            )
-        box = _Box.of(region, len(names.states), len(names.inputs), at)
-        fit = _Fit(made, f, box, samples, seed, notes)
-        return fit.run(g, sec, degree, Path(path), values)
+        return fit_open(
+            *(file, names, region, at, values),
+            g=g,
+            sec=sec,
+            degree=degree,
+            samples=samples,
+            seed=seed,
+        )
+
+
+def fit_open(
+    file: FmuFile,
+    names: Signals,
+    region: Region | None,
+    at: float,
+    values: Values,
+    *,
+    g: Sequence[str] | None = None,
+    sec: Sequence[str] | None = None,
+    degree: int = 2,
+    samples: int = 256,
+    seed: int = 0,
+) -> FittedAgent:
+    """Fit model (1) to an FMU that is loaded; see `fit_agent`."""
+    made, f = _linearised(file, names, at, values)
+    notes = []
+    if region is None:
+        region = _around(file, made)
+        notes.append(
+            "no region was given: a tenth of each variable's size either side was taken; "
+            "give the range where the plant works"
+        )
+    box = _Box.of(region, len(names.states), len(names.inputs), at)
+    fit = _Fit(made, f, box, samples, seed, notes)
+    return fit.run(g, sec, degree, file.path, values)
 
 
 def _linearised(

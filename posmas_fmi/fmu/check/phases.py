@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import ArchiveError, FmuCallError, PosmasError
+from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, PosmasError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.check.journal import Journal, TrialMessages
 from posmas_fmi.fmu.check.surroundings import descriptors, resident, threads
@@ -101,6 +102,9 @@ class Trial:
     def _failed(self, text: str) -> None:
         journal = self.journal
         board = journal.board
+        if board.phase == "control":
+            journal.note("note", "no-control-report", board.call, text[:500])
+            return
         if text.startswith("the FMU returned no instance"):
             code = "no-instance"
         elif "binary cannot be loaded" in text:
@@ -427,6 +431,27 @@ def _judge_leak(trial: Trial, grown: list[int], place: str, what: str) -> None:
         )
 
 
+def control(trial: Trial) -> None:
+    """Linear model, signs, sectors, time constants, a period: what the design needs to know."""
+    from posmas_fmi.fmu.check.control import control_report
+
+    job, report = trial.job, {}
+    with _for_control(trial) as file:
+        for part in control_report(file, job.inputs, job.outputs, trial.t0, job.values):
+            report.update(part)
+            trial.journal.result(control=report)
+
+
+def _for_control(trial: Trial) -> FmuFile:
+    """Load the FMU as `linearise` does: for Model Exchange, if it can that."""
+    job = trial.job
+    arguments = (job.fmu, trial.messages, trial.journal.call, Path(job.unpacked))
+    if trial.file.description.modelExchange is not None:
+        with suppress(FmuError):
+            return ModelExchangeFile(*arguments)
+    return FmuFile(*arguments)
+
+
 def unload(trial: Trial) -> None:
     """Unload the library, and see that nothing happens."""
     done = trial.journal.call("dlclose")
@@ -442,6 +467,7 @@ PHASES: dict[str, Callable[[Trial], None]] = {
     "second": second,
     "leaks": leaks,
     "unload": unload,
+    "control": control,
 }
 
 

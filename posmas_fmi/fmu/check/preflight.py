@@ -93,6 +93,7 @@ def check_fmu(
     values: Mapping[str, float] | None = None,
     *,
     run: bool = True,
+    control: bool = True,
     supervisor: Supervisor | None = None,
     bounds: Bounds | None = None,
 ) -> Preflight:
@@ -107,6 +108,8 @@ def check_fmu(
         Parameters, start values and inputs by name; those of the file by default.
     run : bool
         Whether to try it if nothing fatal was found before.
+    control : bool
+        Whether the trial ends with the control report.
     supervisor : Supervisor, optional
         That tries it, to spare a start for each FMU; one for this FMU alone by default.
     bounds : Bounds, optional
@@ -147,7 +150,8 @@ def check_fmu(
     findings += strict_findings(path, told)
     if not run or worst(findings) == "fatal":
         return Preflight(path, _ordered(findings), told, tuple(binaries))
-    outcome = _tried(path, told, _job(told, inputs, outputs, values), supervisor, bounds)
+    job = _job(told, inputs, outputs, values)
+    outcome = _tried(path, told, job, supervisor, bounds, control)
     findings += outcome.findings
     return Preflight(path, _ordered(findings), told, tuple(binaries), outcome.results)
 
@@ -174,13 +178,14 @@ def _tried(
     job: dict[str, Any],
     supervisor: Supervisor | None,
     bounds: Bounds | None,
+    control: bool,
 ) -> Outcome:
     if told.major == 1:
         return Outcome((Finding("note", "not-tried", "", "an FMU of FMI 1.0 is not run"),))
     if supervisor is not None:
-        return supervisor.examine(path, job, bounds)
+        return supervisor.examine(path, job, bounds, control)
     with Supervisor(bounds) as own:
-        return own.examine(path, job)
+        return own.examine(path, job, None, control)
 
 
 def _ordered(findings: Sequence[Finding]) -> tuple[Finding, ...]:

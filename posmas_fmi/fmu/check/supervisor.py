@@ -26,6 +26,7 @@ from posmas_fmi.fmu.check.finding import Finding
 from posmas_fmi.fmu.check.surroundings import resident_of
 
 PARTS = ("life", "reset", "rollback", "second", "leaks", "unload")
+CONTROL = ("control",)
 _LOOK = 0.02  # s
 _START = 60.0  # s for the process to be ready
 _TAIL = 300  # characters of output that are told
@@ -117,7 +118,13 @@ class Supervisor:
                 server.wait()
             server.stdout.close()
 
-    def examine(self, fmu: Path, job: dict[str, Any], bounds: Bounds | None = None) -> Outcome:
+    def examine(
+        self,
+        fmu: Path,
+        job: dict[str, Any],
+        bounds: Bounds | None = None,
+        control: bool = True,
+    ) -> Outcome:
         """Try an FMU whose archive was found safe.
 
         Parameters
@@ -127,31 +134,49 @@ class Supervisor:
             Attributes of `posmas_fmi.fmu.check.phases.Job` but for fmu, unpacked and phases.
         bounds : Bounds, optional
             In place of the usual ones.
+        control : bool
+            Whether the control report is made as well.
         """
         if not hasattr(os, "fork"):
             text = "trials need a system with fork (Linux, macOS): it was not run"
             return Outcome((Finding("note", "not-tried", "", text),))
         bounds = bounds or self.bounds
-        findings: list[Finding] = []
-        results: dict[str, Any] = {}
         with tempfile.TemporaryDirectory(
             prefix="posmas-fmi-check-", ignore_cleanup_errors=True
         ) as name:
             unpacked = Path(name, "fmu")
             unpack(fmu, unpacked)
-            left: Sequence[str] = PARTS
-            while left:
-                facts = {**job, "fmu": str(fmu), "unpacked": str(unpacked), "phases": left}
-                attempt = self._attempt(Path(name), facts, bounds)
-                known = {(f.code, f.place) for f in findings}
-                new = [f for f in attempt.findings if (f.code, f.place) not in known]
-                findings += new
-                results.update(attempt.results)
-                if attempt.done or attempt.phase not in left or _is_vital(attempt):
-                    break
-                if not new:  # it would go on like this
-                    break
-                left = left[left.index(attempt.phase) + 1 :]
+            facts = {**job, "fmu": str(fmu), "unpacked": str(unpacked)}
+            outcome = self._parts(Path(name), facts, PARTS, bounds)
+            if control and not any(f.severity == "fatal" for f in outcome.findings):
+                more = self._parts(Path(name), facts, CONTROL, bounds)
+                known = {(f.code, f.place) for f in outcome.findings}
+                outcome = Outcome(
+                    (
+                        *outcome.findings,
+                        *(f for f in more.findings if (f.code, f.place) not in known),
+                    ),
+                    {**outcome.results, **more.results},
+                )
+        return outcome
+
+    def _parts(
+        self, folder: Path, job: dict[str, Any], left: Sequence[str], bounds: Bounds
+    ) -> Outcome:
+        """Go through parts of a trial, in a new process after each that was the end of one."""
+        findings: list[Finding] = []
+        results: dict[str, Any] = {}
+        while left:
+            attempt = self._attempt(folder, {**job, "phases": left}, bounds)
+            known = {(f.code, f.place) for f in findings}
+            new = [f for f in attempt.findings if (f.code, f.place) not in known]
+            findings += new
+            results.update(attempt.results)
+            if attempt.done or attempt.phase not in left or _is_vital(attempt):
+                break
+            if not new:  # it would go on like this
+                break
+            left = left[left.index(attempt.phase) + 1 :]
         return Outcome(tuple(findings), results)
 
     def _attempt(self, folder: Path, facts: dict[str, Any], bounds: Bounds) -> _Attempt:

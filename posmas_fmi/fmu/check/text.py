@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator
 
+from posmas_fmi.fmu.check.control import lines as control_lines
 from posmas_fmi.fmu.check.finding import Finding
 from posmas_fmi.fmu.check.preflight import Preflight, facts, measured
 
@@ -18,10 +19,14 @@ def to_text(made: Preflight) -> str:
     Control characters that an FMU put into its names are shown, not sent to the terminal.
     """
     lines = [str(made.path)]
-    for label, text in (*facts(made), *measured(made)):
+    report = made.results.get("control", {})
+    for label, text in (*facts(made), *measured(made), *control_lines(report)):
         lines += _wrapped(f"  {label:<16}", text)
     for finding in made.findings:
         lines += _finding(finding)
+    if report.get("toml"):
+        lines += ["", "# to paste into a scenario; the FMU beside it"]
+        lines += [*report["toml"].rstrip().splitlines(), ""]
     counts = [
         f"{n} {word if n == 1 else words}"
         for severity, word, words in (
