@@ -1,5 +1,6 @@
 """The main job end to end: from scenario file to report, on real FMUs."""
 
+import csv
 import json
 
 import attrs
@@ -298,3 +299,38 @@ def test_results_are_readable_while_they_are_written(tmp_path):
     with h5py.File(tmp_path / "r.nc") as file:
         assert file["time"].shape == (CHUNK + 3,)
         assert file.attrs["complete"] == 0
+
+
+def test_what_is_recorded_can_be_chosen_and_thinned(tmp_path):
+    from posmas_fmi.scenario.tables import RecordTable
+
+    scenario = load("paper_example_1", until=1.005)  # 201 steps
+    whole = results(run(scenario, tmp_path / "whole", report=False))
+    table = RecordTable(every=10, variables=["x", "s"], csv=True)
+    thin = run(attrs.evolve(scenario, record=table), tmp_path / "thin")
+    kept = results(thin)
+    points = [*range(0, 201, 10), 201]
+    assert not {"xhat", "u", "sec_u", "y"} & set(kept.variables)
+    for name in ("time", "x", "s", "x_baseline"):
+        np.testing.assert_array_equal(kept[name], whole[name][points])
+    assert not (thin.folder / "report.html").exists()
+    with (thin.folder / "results.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[:3] == ["time", "s.x1", "s.x2"]
+    column = header.index("x.3.x2")
+    assert [float(row[column]) for row in rows] == kept["x"][:, 2, 1].values.tolist()
+
+
+def test_the_recorder_writes_before_it_holds_much(tmp_path, monkeypatch):
+    from posmas_fmi.cosim import recorder
+    from posmas_fmi.network import network_from_arcs
+
+    monkeypatch.setattr(recorder, "HELD", 10 * 8 * 200)
+    agents = tuple(str(k) for k in range(100))
+    layout = recorder.Layout(agents, ("x1", "x2"), ("u1",), ("y1",))
+    network = network_from_arcs(100, [], [1])
+    with recorder.Recorder(tmp_path / "r.nc", layout, network, ("x",), {}) as one:
+        for k in range(25):
+            one.record(float(k), {"x": np.full((100, 2), k)})
+        with h5py.File(tmp_path / "r.nc", "r") as file:
+            assert len(file["x"]) == 20

@@ -29,6 +29,10 @@ MISTAKES = {
     "misspelt key": ("period =", "periode =", ["$.scenario.periode"], "did you mean period"),
     "misspelt table": ("[leader]", "[leeder]", ["$.leeder", "$.leader"], "did you mean leader"),
     "misspelt design key": ("phi = 10.0", "phy = 10.0", ["$.design.phy"], "did you mean phi"),
+    "no point recorded": ("[leader]", "[record]\nevery = 0\n[leader]", ["$.record.every"], "1"),
+    "unknown recorded": (
+        *("[leader]", '[record]\nvariables = ["z"]\n[leader]', ["$.record.variables[0]"], "xhat"),
+    ),
     "unknown method": ('"contraction"', '"magic"', ["$.design.method"], "contraction"),
     "text for a number": ("until = 10.0", 'until = "10"', ["$.scenario.until"], "number"),
     "NaN": ("[10.3, -9.84]", "[nan, -9.84]", ["$.agent.A[1][0]"], "finite"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -12,7 +14,8 @@ import numpy as np
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
-CHUNK = 512  # rows held in memory before they are written
+CHUNK = 512  # rows held in memory before they are written,
+HELD = 16_000_000  # or fewer: bytes
 
 
 @attrs.frozen
@@ -84,6 +87,7 @@ class Recorder:
         self._blocks: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
         self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
         self._written = dict(self._taken)
+        self._held = 0  # bytes
         # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
         self._disk = h5py.File(path, "w", track_order=True)
         self._file = h5netcdf.File(self._disk, "a")
@@ -139,7 +143,9 @@ class Recorder:
         for name, block in values.items():
             self._blocks[name].append(block if large else np.array(block, dtype=float))
             self._taken[name] += len(block)
-        if max(self._taken[name] - self._written[name] for name in values) >= CHUNK:
+            self._held += block.nbytes
+        rows = max(self._taken[name] - self._written[name] for name in values)
+        if rows >= CHUNK or self._held >= HELD:
             self.flush()
 
     def flush(self) -> None:
@@ -153,6 +159,7 @@ class Recorder:
                 data[self._written[name] : self._taken[name]] = rows
                 blocks.clear()
         self._written = dict(self._taken)
+        self._held = 0
         self._disk.flush()
 
     @property
@@ -181,6 +188,92 @@ class Recorder:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+class Thinned:
+    """Rows that come in blocks, thinned out: the first, every k-th after it, and the last.
+
+    Parameters
+    ----------
+    add : callable
+        Gets what is left of each block: arrays (r, …) by name.
+    every : int
+        k; 1 leaves all.
+
+    Attributes
+    ----------
+    rows : int
+        Number of rows that came.
+
+    Examples
+    --------
+    >>> thinned = Thinned(lambda values: print(values["a"]), every=2)
+    >>> thinned({"a": np.array([0, 1, 2])})
+    [0 2]
+    >>> thinned({"a": np.array([3])})
+    >>> thinned.finish()
+    [3]
+    """
+
+    def __init__(self, add: Callable[[dict[str, Array]], None], every: int) -> None:
+        self._add, self._every = add, every
+        self._last: dict[str, Array] = {}
+        self.rows = 0
+
+    def __call__(self, values: dict[str, Array]) -> None:
+        """Take a block."""
+        first, every = -self.rows % self._every, self._every
+        count = max(map(len, values.values()), default=0)
+        if first < count:
+            self._add({name: block[first::every] for name, block in values.items()})
+        self.rows += count
+        between = count and (self.rows - 1) % every
+        self._last = {n: np.array(b[-1:]) for n, b in values.items()} if between else {}
+
+    def finish(self) -> None:
+        """Pass the last row on if it was left out."""
+        if self._last:
+            self._add(self._last)
+            self._last = {}
+
+
+def write_csv(results: Path, path: Path) -> None:
+    """Write the signals of a result as CSV: a column for each number, named by its coordinates.
+
+    Parameters
+    ----------
+    results : Path
+        Of a `Recorder` that is closed.
+    path : Path
+        Replaced if it exists. Columns are ``time``, ``x.AGENT.STATE``, ``u.AGENT.INPUT``,
+        ``s.STATE`` and so on; a number that is missing is left empty.
+    """
+    import csv
+
+    import h5netcdf
+
+    with h5netcdf.File(results, "r") as file, path.open("w", newline="", encoding="utf-8") as text:
+        labels = {
+            name: [label.decode() if isinstance(label, bytes) else label for label in variable[...]]
+            for name, variable in file.variables.items()
+            if variable.dimensions == (name,) and name != "time"
+        }
+        signals = {n: v for n, v in file.variables.items() if v.dimensions[:1] == ("time",)}
+        names = ["time", *sorted(name for name in signals if name != "time")]
+        writer = csv.writer(text)
+        writer.writerow(
+            ".".join((name, *coordinates))
+            for name in names
+            for coordinates in product(*(labels[d] for d in signals[name].dimensions[1:]))
+        )
+        rows = len(file.dimensions["time"])
+        width = sum(int(np.prod(signals[name].shape[1:])) for name in names)
+        block = max(1, HELD // (64 * width))  # numbers take more room as text
+        for begin in range(0, rows, block):
+            end = min(begin + block, rows)
+            columns = [signals[name][begin:end].reshape(end - begin, -1) for name in names]
+            for row in np.concatenate(columns, axis=1).tolist():
+                writer.writerow("" if value != value else value for value in row)
 
 
 def _text() -> Any:

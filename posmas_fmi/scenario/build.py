@@ -36,6 +36,7 @@ from posmas_fmi.scenario.tables import (
     JumpTable,
     NetworkTable,
     PlantTable,
+    RecordTable,
     ScenarioFile,
     ScenarioTable,
     SensorTable,
@@ -67,6 +68,8 @@ class Scenario:
     s0 : (m,) array
     baseline : bool
         Whether the run without control is made as well.
+    record : RecordTable
+        What of a run is kept.
     control : ControlTable
     controllers : dict of str to ControlTable
         By the names that `compare` may use.
@@ -103,6 +106,7 @@ class Scenario:
     xhat0: Array
     s0: Array
     baseline: bool
+    record: RecordTable
     control: ControlTable
     controllers: dict[str, ControlTable]
     compare: CompareTable | None
@@ -227,6 +231,7 @@ class _Builder:
                 self.attempt(lambda: make_episodes(tables.fault, network, agent, clock))
             self.attempt(lambda: make_channel(tables.channel, network, clock.h))
         self.check_components(network)
+        self.check_record()
         made: dict[str, Signal] = {}
         if network and clock:
             agents, head = network.N, tables.scenario
@@ -262,6 +267,7 @@ class _Builder:
             xhat0=xhat0,
             s0=s0,
             baseline=tables.report.baseline,
+            record=tables.record,
             control=tables.control,
             controllers=tables.controllers,
             compare=tables.compare,
@@ -292,6 +298,18 @@ class _Builder:
                     (place, f"expected a name of its own without a dot (got {table.name!r})")
                 )
             taken.add(table.name)
+
+    def check_record(self) -> None:
+        """Nothing may be missing that the KPIs of cooling runs are computed from."""
+        record = self.tables.record
+        if record.every < 1:
+            self.problems.append(
+                ("$.record.every", f"expected a whole number >= 1 (got {record.every})")
+            )
+        if self.tables.cooling is not None and record.every > 1:
+            self.problems.append(
+                ("$.record.every", "expected 1: the KPIs of [cooling] need every point")
+            )
 
     def attempt(self, make: Callable[[], T]) -> T | None:
         try:

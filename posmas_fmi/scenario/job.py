@@ -20,7 +20,7 @@ from posmas_fmi.cosim.conditions import Sensors
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.law import Law, ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, Outcome, Progress, System
-from posmas_fmi.cosim.recorder import Layout, Recorder
+from posmas_fmi.cosim.recorder import Layout, Recorder, Thinned, write_csv
 from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
@@ -37,7 +37,7 @@ from posmas_fmi.scenario.verdict import summarise
 
 log = logging.getLogger(__name__)
 
-RECORDED = ("x", "xhat", "u", "sec_u", "y", "s")
+NEEDED = {"xhat", "u", "y", "s"}  # by the report
 PACKAGES = ("posmas-fmi", "numpy", "scipy", "sympy", "fmpy", "h5netcdf", "h5py")
 
 
@@ -156,7 +156,7 @@ def run_designed(
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     make_folder(folder)
-    for name in ("summary.json", "report.html"):
+    for name in ("summary.json", "report.html", "results.csv"):
         (folder / name).unlink(missing_ok=True)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     if scenario.cooling is not None:
@@ -197,7 +197,12 @@ def run_designed(
         judge(scenario, designed, outcome, folder / "results.nc", summary)
     summary["wall_s"] = round(time.perf_counter() - began, 3)
     write_json(folder / "summary.json", summary)
-    if report:
+    if scenario.record.csv:
+        write_csv(folder / "results.nc", folder / "results.csv")
+    missing = sorted(NEEDED.difference(scenario.record.variables))
+    if report and missing:
+        log.warning("no report: $.record.variables leaves %s out", ", ".join(missing))
+    elif report:
         write_report(folder)
     return RunResult(folder, designed, summary)
 
@@ -212,7 +217,9 @@ def _simulate(
     started: Callable[[FmuPlant], None],
 ) -> tuple[Outcome, Outcome | None]:
     """Run with the design, then once more without control for comparison."""
-    variables = (*RECORDED, "x_baseline") if scenario.baseline else RECORDED
+    recorded, baselines = tuple(scenario.record.variables), scenario.baseline
+    with_baseline = baselines and "x" in recorded
+    variables = (*recorded, "x_baseline") if with_baseline else recorded
     with (
         instances.start() as plant,
         _recorder(scenario, designed.network, instances, folder, variables) as recorder,
@@ -221,8 +228,10 @@ def _simulate(
         system = make_system(scenario, designed, instances)
         split, more = instances.recorded, _more(scenario, system.law)
 
+        thinned = Thinned(recorder.add, scenario.record.every)
+
         def record(times: Array, values: dict[str, Array]) -> None:
-            recorder.record_block(times, split.named(values) | more(times))
+            thinned({"time": times, **split.named(values), **more(times)})
 
         outcome = engine.run(
             system,
@@ -231,12 +240,16 @@ def _simulate(
             progress("simulate"),
             choice,
             scenario.settings.threads,
-            variables=(*RECORDED, "extra"),
+            variables=(*recorded, "extra"),
         )
+        thinned.finish()
         recorder.flush()
         baseline = None
-        if scenario.baseline and outcome.ended in ("complete", "diverged"):
-            baseline = _without_control(scenario, designed, instances, choice, recorder, progress)
+        if baselines and outcome.ended in ("complete", "diverged"):
+            add = recorder.add if with_baseline else lambda values: None
+            baseline = _without_control(
+                scenario, designed, instances, choice, add, thinned.rows, progress
+            )
         if outcome.ended == "complete":
             recorder.finish()
     return outcome, baseline
@@ -247,21 +260,20 @@ def _without_control(
     designed: Design,
     instances: Instances,
     choice: engine.Choice,
-    recorder: Recorder,
+    add: Callable[[dict[str, Array]], None],
+    points: int,
     progress: Callable[[str], Progress | None],
 ) -> Outcome:
+    """Run with K = 0 and add x as a baseline, no further than the run it is compared with."""
     uncontrolled = attrs.evolve(designed, K=np.zeros_like(designed.K))
-    rows = recorder.rows
+    thinned = Thinned(add, scenario.record.every)
 
     def record(times: Array, values: dict[str, Array]) -> None:
-        nonlocal rows
-        if rows and "x" in values:  # no further than the run that it is compared with
-            block = values["x"][:rows]
-            rows -= len(block)
-            recorder.add({"x_baseline": block})
+        if thinned.rows < points and "x" in values:
+            thinned({"x_baseline": values["x"][: points - thinned.rows]})
 
     with instances.start() as plant:
-        return engine.run(
+        outcome = engine.run(
             make_system(scenario, uncontrolled, instances),
             plant,
             record,
@@ -270,6 +282,9 @@ def _without_control(
             scenario.settings.threads,
             variables=("x",),
         )
+    if thinned.rows == points:
+        thinned.finish()
+    return outcome
 
 
 def make_law(scenario: Scenario, designed: Design) -> Law:

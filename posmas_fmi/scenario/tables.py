@@ -616,6 +616,28 @@ class CoolingTable:
 
 
 @attrs.frozen
+class RecordTable:
+    """``[record]``: what of a run is kept.
+
+    Attributes
+    ----------
+    every : int
+        Only every k-th communication point, and the last one.
+    variables : list of str
+        Of ``x``, ``xhat``, ``u``, ``sec_u``, ``y``, ``s``. The report needs ``xhat``, ``u``, ``y``
+        and ``s``: without one of them there is none.
+    csv : bool
+        Whether ``results.csv`` is written as well.
+    """
+
+    every: int = 1
+    variables: list[Literal["x", "xhat", "u", "sec_u", "y", "s"]] = attrs.field(
+        factory=lambda: ["x", "xhat", "u", "sec_u", "y", "s"]
+    )
+    csv: bool = False
+
+
+@attrs.frozen
 class ReportTable:
     """``[report]``: what the report shows.
 
@@ -641,6 +663,7 @@ class ScenarioFile:
     initial: InitialTable = attrs.field(factory=InitialTable)
     channel: ChannelTable = attrs.field(factory=ChannelTable)
     report: ReportTable = attrs.field(factory=ReportTable)
+    record: RecordTable = attrs.field(factory=RecordTable)
     signals: dict[str, SignalTable] = attrs.field(factory=dict)
     component: list[ComponentTable] = attrs.field(factory=list)
     connection: list[ConnectionTable] = attrs.field(factory=list)
