@@ -128,7 +128,7 @@ def floor(setting: Setting, library: ctypes.CDLL, inputs: np.ndarray) -> float:
     function = library.floor_run
     function.argtypes = [
         *(ctypes.c_int, pointer, pointer, pointer, pointer, word),
-        *(pointer, size, size, pointer, size, size, ctypes.c_double, pointer, word),
+        *(pointer, size, size, pointer, size, size, ctypes.c_double, pointer, word, word),
     ]
     function.restype = word
     with FmuFile(setting.fmu) as file:
@@ -146,7 +146,7 @@ def floor(setting: Setting, library: ctypes.CDLL, inputs: np.ndarray) -> float:
                 *(3, *address, components.ctypes.data, setting.n),
                 *(ctypes.addressof(u.references), 1, u.size),
                 *(ctypes.addressof(y.references), 1, y.size),
-                *(H, inputs.ctypes.data, setting.steps),
+                *(H, inputs.ctypes.data, 0, setting.steps),
             )
             assert bad == 0
 
