@@ -241,3 +241,14 @@ def test_any_beginning_of_a_library_is_read_or_refused(good: Path, size: int) ->
     name = next(n for n in entries(good) if n.startswith("binaries/"))
     with pytest.raises(ImageError):
         read_image(entries(good)[name][:size])
+
+
+def test_a_folder_may_be_listed_twice(tmp_path: Path) -> None:
+    """Roberts of the Reference FMUs lists ``extra/`` twice: nothing is ambiguous about that."""
+    path = tmp_path / "twice.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", "<fmiModelDescription/>")
+        archive.writestr("extra/", "")
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            archive.writestr("extra/", "")
+    assert [f.code for f in examine(path) if f.severity == "fatal"] == []

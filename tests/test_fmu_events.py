@@ -27,18 +27,20 @@ from posmas_fmi.fmu.stepped import SteppedInstance
 CLOCKED = Path(__file__).parent / "clocked"
 
 
-@pytest.fixture(scope="module")
-def clocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The FMU of the folder `clocked`."""
+def packed(folder: Path, code: str) -> Path:
+    """Make an FMU of the folder `clocked`, with this C code."""
     target = host()
-    library = shared_library(
-        {"model.c": (CLOCKED / "model.c").read_text()}, ["model.c"], "clocked", target
-    )
-    path = tmp_path_factory.mktemp("clocked") / "clocked.fmu"
+    library = shared_library({"model.c": code}, ["model.c"], "clocked", target)
+    path = folder / "clocked.fmu"
     with zipfile.ZipFile(path, "w") as archive:
         archive.write(CLOCKED / "modelDescription.xml", "modelDescription.xml")
         archive.writestr(f"binaries/{target.name}/clocked{target.extension}", library)
     return path
+
+
+@pytest.fixture(scope="module")
+def clocked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return packed(tmp_path_factory.mktemp("clocked"), (CLOCKED / "model.c").read_text())
 
 
 @pytest.fixture

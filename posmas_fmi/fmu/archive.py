@@ -170,7 +170,7 @@ def _entries(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[Finding]:
     for entry in entries:
         yield from _entry(entry)
     for name, count in names.items():
-        if count > 1 and name != DESCRIPTION:
+        if count > 1 and name != DESCRIPTION and not name.endswith("/"):
             yield _fatal(
                 "archive-duplicate", name, f"it is in the archive {count} times: which one counts?"
             )
