@@ -27,13 +27,13 @@ from posmas_fmi.fmu.stepped import SteppedInstance
 CLOCKED = Path(__file__).parent / "clocked"
 
 
-def packed(folder: Path, code: str) -> Path:
-    """Make an FMU of the folder `clocked`, with this C code."""
+def packed(folder: Path, code: str, description: Path = CLOCKED) -> Path:
+    """Make an FMU of this C code, with the description in a folder."""
     target = host()
     library = shared_library({"model.c": code}, ["model.c"], "clocked", target)
     path = folder / "clocked.fmu"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.write(CLOCKED / "modelDescription.xml", "modelDescription.xml")
+        archive.write(description / "modelDescription.xml", "modelDescription.xml")
         archive.writestr(f"binaries/{target.name}/clocked{target.extension}", library)
     return path
 

@@ -16,7 +16,7 @@ from posmas_fmi.cosim import native
 from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap, Whole
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.about import About
+from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
@@ -93,7 +93,11 @@ class FmuPlant:
         messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
             paths = dict.fromkeys(spec.fmu for spec in specs)
-            files = {path: stack.enter_context(open_fmu(path, messages)) for path in paths}
+            structure = {path: structure_of(path, specs) for path in paths}
+            files = {
+                path: stack.enter_context(open_fmu(path, messages, structure=structure[path]))
+                for path in paths
+            }
             known = {
                 (fmu, ports): converted(files[fmu].about, ports)
                 for fmu, ports in dict.fromkeys(
@@ -258,6 +262,29 @@ def _tell(findings: list[StartFinding]) -> None:
             "%s: %s%s: start value %r %s: %s",
             *(one["fmu"], who[0], more, one["variable"], one["what"], one["message"]),
         )
+
+
+def structure_of(path: Path, specs: Sequence[PlantSpec]) -> Mapping[str, int]:
+    """Return the structural parameters among the values of all instances of an FMU.
+
+    Raises
+    ------
+    InputError
+        If instances differ in one: then arrays of theirs have different lengths.
+    """
+    about = read_about(path)
+    found: dict[tuple[tuple[str, int], ...], str] = {}
+    for spec in specs:
+        if spec.fmu == path:
+            structure = about.structured(spec.values).structure
+            found.setdefault(tuple(sorted(structure.items())), spec.name)
+    if len(found) > 1:
+        names = " and ".join(list(found.values())[:2])
+        raise InputError(
+            f"{path.name}: expected the same structural parameters in all instances ({names} "
+            "differ); use a copy of the file for those that are different"
+        )
+    return dict(next(iter(found), ()))
 
 
 def converted(about: About, ports: PortMap) -> PortMap:

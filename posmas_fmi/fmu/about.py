@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import attrs
+import numpy as np
 
 from posmas_fmi.errors import ArchiveError, FmuError, InputError
 from posmas_fmi.fmu.archive import examine
@@ -31,6 +32,8 @@ class About:
     kind : {"Co-Simulation", "Model Exchange"}
         How it is run; Co-Simulation where it offers both.
     names : Variables
+    structure : mapping of str to int
+        Structural parameters that are not as the file says, by name.
     """
 
     path: Path
@@ -38,6 +41,7 @@ class About:
     description: Any
     kind: Kind
     names: Variables
+    structure: Mapping[str, int] = attrs.field(factory=dict)
 
     @classmethod
     def of(cls, path: Path, description: Any, kind: Kind | None = None) -> About:
@@ -59,6 +63,32 @@ class About:
             raise ArchiveError(f"cannot read the variables: {error}", where) from error
         version: Literal[2, 3] = 2 if told == "2.0" else 3
         return cls(path, version, description, kind, Variables(variables, where))
+
+    def structured(self, values: Mapping[str, Any]) -> About:
+        """Return what it says with the structural parameters among these values: other shapes.
+
+        Raises
+        ------
+        InputError
+            If one is no whole number >= 0.
+        """
+        given = {
+            name: value
+            for name, value in values.items()
+            if name in self.variables and self.variables[name].causality == "structuralParameter"
+        }
+        if not given:
+            return self
+        for name, value in given.items():
+            if isinstance(value, str) or np.ndim(value) or value < 0 or value != int(value):
+                raise InputError(
+                    f"{self.path.name}: expected a whole number >= 0 for {name!r} (got {value!r})"
+                )
+        structure = {**self.structure, **{name: int(value) for name, value in given.items()}}
+        named = {name: one.resized(structure) for name, one in self.variables.items()}
+        return attrs.evolve(
+            self, names=attrs.evolve(self.names, by_name=named), structure=structure
+        )
 
     @property
     def variables(self) -> Mapping[str, Variable]:

@@ -6,7 +6,7 @@ import ctypes
 import os
 import tempfile
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -35,6 +35,8 @@ class FmuFile:
         Called with the name before each call into the binary; see `Binding`.
     unpacked : Path, optional
         Where somebody has unpacked the archive already, who removes it again.
+    structure : mapping of str to int, optional
+        Structural parameters: set in Configuration Mode before all else, in every instance.
 
     Attributes
     ----------
@@ -76,8 +78,10 @@ class FmuFile:
         messages: Messages | None = None,
         trace: Trace | None = None,
         unpacked: Path | None = None,
+        structure: Mapping[str, int] | None = None,
     ) -> None:
         self.path = Path(path)
+        self._structure = dict(structure or {})
         self._trace = trace
         folder = None
         try:
@@ -101,7 +105,8 @@ class FmuFile:
 
     def _open(self, folder: Path) -> None:
         where = str(self.path)
-        self.about = About.of(self.path, read_description(folder, self.path), self.kind)
+        about = About.of(self.path, read_description(folder, self.path), self.kind)
+        self.about = about.structured(self._structure)
         interface = self.about.interface
         if interface is None:
             raise FmuError(f"expected a {self.kind} interface (it has none)", where)
@@ -192,6 +197,7 @@ class FmuFile:
         """
         if self.closed:
             raise FmuError("the file is closed", str(self.path))
+        self._check_only_once()
         key = next(KEYS)
         live = self._live[key] = Live(
             self._messages, callbacks_for(self.version, self._messages, key)
@@ -204,7 +210,20 @@ class FmuFile:
                 f"{self.path.name}: {name}: fmi{self.version}Instantiate",
                 name,
             )
-        return self._made(name, key)
+        instance = self._made(name, key)
+        if self.about.structure:
+            instance.configure(self.about.structure)
+        return instance
+
+    def _check_only_once(self) -> None:
+        interface = self.about.interface
+        if self._live and getattr(interface, "canBeInstantiatedOnlyOncePerProcess", False):
+            raise FmuError(
+                "it says that a process can have only one instance of it "
+                "(canBeInstantiatedOnlyOncePerProcess), and there is one; run its instances in "
+                "processes of their own",
+                str(self.path),
+            )
 
     def _made(self, name: str, key: int) -> FmuInstance:
         return FmuInstance(self, name, key)

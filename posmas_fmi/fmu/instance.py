@@ -28,6 +28,7 @@ _LOG = logging.getLogger(__name__)
 _MOST_RETURNS = 100_000  # before the end of one step
 _MOST_STUCK = 100  # of them at the same time
 _SAME = 1e-9  # of a step: times that are the same
+_PENDING = 5
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
 
@@ -153,8 +154,10 @@ class FmuInstance:
         messages : iterable of str
             What the instance said during the call.
         """
-        label = status_label(status)
-        return self.error(function, said(f"returned status {status} ({label})", messages))
+        text = f"returned status {status} ({status_label(status)})"
+        if status == _PENDING:
+            text += ", as if the call went on by itself; such asynchronous steps are not supported"
+        return self.error(function, said(text, messages))
 
     def _where(self, function: str) -> str:
         return f"{self.file.path.name}: {self.name}: {self._prefix}{function}"
@@ -206,6 +209,12 @@ class FmuInstance:
         self.enter_initialization(start=start, stop=stop, tolerance=tolerance)
         self.set({n: v for n, v in values.items() if variable(n).causality == "input"})
         self.exit_initialization()
+
+    def configure(self, structure: Mapping[str, int]) -> None:
+        """Set structural parameters in Configuration Mode, right after instantiation (FMI 3)."""
+        self.call("EnterConfigurationMode")
+        self.set(structure)
+        self.call("ExitConfigurationMode")
 
     def enter_initialization(
         self, *, start: float = 0.0, stop: float | None = None, tolerance: float | None = None
@@ -330,6 +339,36 @@ class FmuInstance:
         count = (group.size,) if self.file.version == 3 else ()
         references = group.references
         self.call(direction + group.kind, references, len(references), pointer(values), *count)
+
+    def set_input_derivatives(self, ports: Ports, values: ArrayLike, order: int = 1) -> None:
+        """Tell how continuous inputs go on during the next step, instead of being held (FMI 2).
+
+        Parameters
+        ----------
+        ports : Ports
+            Inputs that are Reals.
+        values : (n,) array_like
+            Derivative of that order of each [1/s**order].
+        order : int
+            From 1.
+
+        Raises
+        ------
+        FmuError
+            If the FMU does not say that it interpolates inputs (canInterpolateInputs).
+        """
+        interface = self.file.about.interface
+        if self.file.version != 2 or not getattr(interface, "canInterpolateInputs", False):
+            raise self.error(
+                "SetRealInputDerivatives", "it does not interpolate inputs (canInterpolateInputs)"
+            )
+        given = np.array(values, dtype=float).reshape(-1)
+        if given.size != len(ports.names):
+            raise FmuError(f"expected {len(ports.names)} values (got {given.size})", self.name)
+        n = len(ports.references)
+        in_order, orders = np.empty(n), (ctypes.c_int * n)(*[order] * n)
+        in_order[ports.places] = given
+        self.call("SetRealInputDerivatives", ports.references, n, orders, pointer(in_order))
 
     def get(self, name: str) -> Any:
         """Return a value by name: a float, an int, a str, or an array of the variable's shape."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -95,6 +95,17 @@ class ModelExchangeInstance(FmuInstance):
             self._completes = bool(interface.needsCompletedIntegratorStep)
 
     # ---- modes ----------------------------------------------------------------------------------
+
+    def configure(self, structure: Mapping[str, int]) -> None:
+        """Set structural parameters, which the numbers of states and indicators may follow."""
+        super().configure(structure)
+        for name, what in (
+            ("n_states", "ContinuousStates"),
+            ("n_indicators", "EventIndicators"),
+        ):
+            count = ctypes.c_size_t()
+            self.call(f"GetNumberOf{what}", ctypes.byref(count))
+            setattr(self, name, count.value)
 
     def start(self) -> None:
         """After `initialise`: settle the discrete states and enter Continuous-Time Mode."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from posmas_fmi.errors import FmuError
@@ -18,6 +19,7 @@ def open_fmu(
     messages: Messages | None = None,
     trace: Trace | None = None,
     unpacked: Path | None = None,
+    structure: Mapping[str, int] | None = None,
 ) -> FmuFile:
     """Open an FMU whose instances take communication steps; parameters as `FmuFile`.
 
@@ -38,4 +40,4 @@ def open_fmu(
     kind: type[FmuFile] = FmuFile if about.kind == "Co-Simulation" else SteppedFile
     if needs_event_mode(about):
         kind = EventFile
-    return kind(path, messages, trace, unpacked)
+    return kind(path, messages, trace, unpacked, structure)

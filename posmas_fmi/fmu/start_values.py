@@ -51,6 +51,8 @@ def settable(
     """
     kept, findings = {}, []
     for name, value in values.items():
+        if about.structure.get(name) == value:
+            continue  # set when the instance was made
         why = _not_settable(about.variable(name))
         if why:
             findings.append(StartFinding(instance, about.path.name, name, "not set", why))
@@ -62,6 +64,8 @@ def settable(
 def _not_settable(variable: Variable) -> str:
     if variable.variability == "constant":
         return "it is a constant"
+    if variable.causality == "structuralParameter":
+        return "it is a structural parameter, which is set when a file is opened"
     if variable.causality in ("calculatedParameter", "independent"):
         return f"its causality is {variable.causality}"
     # some exporters give a start value and forget to say that it counts

@@ -93,6 +93,17 @@ class Variable:
             initial=source.initial or "",
         )
 
+    def resized(self, structure: Mapping[str, int]) -> Variable:
+        """Return it with the lengths that structural parameters of these values give it."""
+        lengths = [
+            structure.get(one, known) if isinstance(one, str) else known
+            for one, known in zip(self.lengths, self.shape, strict=False)
+        ]
+        shape = tuple(lengths) if self.lengths else self.shape
+        if shape == self.shape:
+            return self
+        return attrs.evolve(self, shape=shape, start=None)
+
     @property
     def size(self) -> int:
         """Number of elements."""

@@ -125,7 +125,12 @@ def make_instances(
         what is wired to what is not clear.
     """
     plant, N = scenario.plant, scenario.network.N
-    abouts = {path: read_about(path) for path in dict.fromkeys(files)}
+    values = [_values(scenario, k) for k in range(N)]
+    values += [table.parameters for table in scenario.components]
+    abouts: dict[Path, About] = {}
+    for path, given in zip(files, values, strict=True):
+        if path not in abouts:  # structural parameters are the same for all instances of a file
+            abouts[path] = read_about(path).structured(given)
     every = _periods(scenario)
     _check_periods(scenario, [abouts[path] for path in files], every)
     shows_states = _shows_states(scenario)
