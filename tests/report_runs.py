@@ -161,6 +161,8 @@ def write_run(
     design: dict[str, Any] | None = None,
     complete: int = 1,
     scenario: str = "paper-example-1",
+    recorded: dict[str, np.ndarray] | None = None,
+    **summary: Any,
 ) -> Path:
     """Write results.nc and the three JSON files of a run as the master does."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -178,6 +180,8 @@ def write_run(
     for name, values in signals.items():
         if name not in ("time", "s"):
             variables[name] = (("time", "agent", dims.get(name, "output")), values)
+    for name, values in (recorded or {}).items():
+        variables[name] = (("time", "agent")[: values.ndim], values)
     dataset = xr.Dataset(
         variables,
         coords={"time": ("time", signals["time"], {"units": "s"}), "agent": ("agent", names)},
@@ -191,7 +195,7 @@ def write_run(
     dataset.to_netcdf(folder / "results.nc", engine="h5netcdf")
     (folder / "design.json").write_text(json.dumps(design or design_facts()), encoding="utf-8")
     (folder / "summary.json").write_text(
-        json.dumps(_summary(signals, names, verdict)), encoding="utf-8"
+        json.dumps(_summary(signals, names, verdict) | summary), encoding="utf-8"
     )
     (folder / "manifest.json").write_text(
         json.dumps(
@@ -282,6 +286,51 @@ def cut_off(folder: Path, steps: int = 400) -> Path:
     return folder
 
 
+def with_faults(folder: Path, **changes: Any) -> Path:
+    """Example 1 with a fault, an FMU that failed, delays, and variables recorded besides."""
+    lp, d = laplacians(4, ARCS, [2])
+    signals = simulate(lp, d)
+    time = signals["time"]
+    given = {
+        "recorded": {
+            "heat_load": 5e4 * (1 + 0.1 * np.sin(time[:, None] + np.arange(4))),
+            "facility.T_supply": 305.15 + 0.2 * np.sin(0.5 * time),
+        },
+        "coverage": [
+            {"what": "delay of messages", "covered": True, "why": "certificate D: held"},
+            {"what": "rounded messages", "covered": False, "why": "a bounded disturbance"},
+        ],
+        "faults": [
+            {
+                "kind": "sensor bias",
+                "agent": "3",
+                "from": 2.0,
+                "until": 4.0,
+                "detail": "an added value",
+                "covered": "not covered, but bounded",
+            },
+            {
+                "kind": "leader lost",
+                "agent": "all",
+                "from": 7.0,
+                "until": None,
+                "detail": "the last state heard is held",
+                "covered": "covered by certificate D as a delay",
+            },
+        ],
+        "incidents": [
+            {
+                "agent": "2",
+                "time": 5.125,
+                "verdict": "killed by signal 9",
+                "action": "frozen: its last outputs are held",
+            }
+        ],
+        **changes,
+    }
+    return write_run(folder, signals, ARCS, [2], **given)
+
+
 def single_agent(folder: Path) -> Path:
     lp, d = laplacians(1, [], [1])
     return write_run(folder, simulate(lp, d, until=4.0), [], [1], names=["cooling line"])
@@ -310,5 +359,6 @@ RUNS: dict[str, Callable[[Path], Path]] = {
     "example_1_printed": example_1_printed,
     "cut_off": cut_off,
     "single_agent": single_agent,
+    "with_faults": with_faults,
     "many_agents": many_agents,
 }

@@ -41,7 +41,10 @@ def test_every_section_has_a_heading_and_a_size(browser: Any, page: Path) -> Non
         assert element.size["height"] > 40, section
         assert element.is_displayed()
     linked = browser.find_elements("css selector", "nav a")
-    assert len(linked) == len(SECTIONS) - 1
+    sections = browser.find_elements("css selector", "main > section")
+    assert len(linked) == len(sections) >= len(SECTIONS) - 1
+    for link, section in zip(linked, sections, strict=True):
+        assert link.get_attribute("href").endswith(f"#{section.get_attribute('id')}")
 
 
 def test_every_drawing_is_visible_and_described(browser: Any, page: Path) -> None:

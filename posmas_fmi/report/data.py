@@ -69,8 +69,47 @@ class AgentVerdict:
 
 
 @attrs.frozen
+class Used:
+    """What a run used beyond the loop that is certified, and whether the proof covers it."""
+
+    what: str
+    covered: bool
+    why: str
+
+
+@attrs.frozen
+class Fault:
+    """A fault of the scenario; times in seconds, None where it has no end.
+
+    `covered` is a sentence; `proved` whether it says that a certificate covers the fault.
+    """
+
+    kind: str
+    agent: str
+    begin: float | None
+    end: float | None
+    detail: str
+    covered: str
+    proved: bool
+
+
+@attrs.frozen
+class Incident:
+    """An FMU that failed while the run went on."""
+
+    agent: str
+    time: float | None
+    call: str
+    verdict: str
+    action: str
+
+
+@attrs.frozen
 class Summary:
-    """What ``summary.json`` says about the run; derived from the results if the run was cut off."""
+    """What ``summary.json`` says about the run; derived from the results if the run was cut off.
+
+    `coverage` is None for a run that does not say what it used.
+    """
 
     verdict: str
     reason: str
@@ -82,6 +121,17 @@ class Summary:
     steps: int | None
     comparison: Mapping[str, Any]
     notes: tuple[str, ...]
+    coverage: tuple[Used, ...] | None = None
+    faults: tuple[Fault, ...] = ()
+    incidents: tuple[Incident, ...] = ()
+
+    @property
+    def uncovered(self) -> tuple[str, ...]:
+        """What was used or went wrong and no certificate covers."""
+        used = [row.what for row in self.coverage or () if not row.covered]
+        faults = [fault.kind for fault in self.faults if not fault.proved]
+        failed = ["an FMU that failed"] if self.incidents else []
+        return tuple(dict.fromkeys([*used, *faults, *failed]))
 
 
 @attrs.frozen(eq=False)
@@ -102,6 +152,8 @@ class Run:
         Input and what the sector nonlinearity makes of it. sec_u may be None.
     y : (T, N, q) array
         Outputs.
+    recorded : mapping
+        Name -> what was recorded besides, (T, N) of the agents or (T,).
     stride : int
         Every how many stored samples one was read.
     """
@@ -123,6 +175,7 @@ class Run:
     u: Array
     sec_u: Array | None
     y: Array
+    recorded: Mapping[str, Array]
     design: DesignFacts
     summary: Summary
     manifest: Mapping[str, Any]

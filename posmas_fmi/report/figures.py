@@ -33,6 +33,7 @@ DASHES = ("solid", (0, (4.0, 1.4)))
 
 # A plot cannot show more; far beyond it matplotlib's transforms overflow.
 LARGEST_SHOWN = 1e60
+FAULT = "#f6e3cf"  # behind the lines while a fault holds
 FLOOR = 1e-16  # of the first error, under which a logarithmic plot shows rounding only
 
 
@@ -131,6 +132,21 @@ def input_panel(run: Run, k: int, name: str, alt: str) -> str:
         return to_svg(figure, name, alt)
 
 
+def recorded_panel(run: Run, label: str, name: str, alt: str) -> str:
+    """Draw what was recorded besides: of all agents, or one line of the run."""
+    with look():
+        figure, axes = _panel(run, label, run.units.get(label, ""))
+        values = run.recorded[label]
+        if values.ndim == 1:
+            axes.plot(*thin(run.time, values), color=BLUE)
+        else:
+            _agents(axes, run, values)
+        if _largest(values) > 1e9:
+            _symlog(axes, 1.0)
+        _mark_loss(axes, run)
+        return to_svg(figure, name, alt)
+
+
 def sector_panel(run: Run, k: int, name: str, alt: str) -> str:
     """Draw ``sec(u)`` against ``u`` for input k, with the sector ``[m_l, m_h]``."""
     assert run.sec_u is not None
@@ -194,7 +210,20 @@ def _panel(run: Run, label: str, unit: str) -> tuple[Figure, Axes]:
     axes.set_ylabel(label + _unit(unit))
     if run.time.size > 1:
         axes.set_xlim(run.time[0], run.time[-1])
+    for begin, end in faulty(run):
+        axes.axvspan(begin, end, facecolor=FAULT, edgecolor="none", zorder=0)
     return figure, axes
+
+
+def faulty(run: Run) -> list[tuple[float, float]]:
+    """Return when faults of the scenario hold, as far as the run went [s]."""
+    spans = []
+    for fault in run.summary.faults:
+        begin = run.time[0] if fault.begin is None else fault.begin
+        end = run.until if fault.end is None else min(fault.end, run.until)
+        if np.isfinite([begin, end]).all() and begin < end:
+            spans.append((float(begin), float(end)))
+    return spans
 
 
 def _unit(unit: str) -> str:

@@ -15,7 +15,15 @@ import numpy as np
 from posmas_fmi.agent import Assumption, Status
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.report.data import AgentVerdict, Condition, DesignFacts, Summary
+from posmas_fmi.report.data import (
+    AgentVerdict,
+    Condition,
+    DesignFacts,
+    Fault,
+    Incident,
+    Summary,
+    Used,
+)
 from posmas_fmi.report.foreign import AGAIN, clean, number, one_line
 
 
@@ -216,4 +224,36 @@ def summary_facts(content: dict[str, Any], path: Path) -> Summary:
         steps=None if steps is None or math.isinf(steps) else int(steps),
         comparison=keys.mapping("comparison"),
         notes=(*keys.texts("messages"), *_traffic(keys)),
+        coverage=tuple(
+            Used(row.text("what"), row.flag("covered"), row.text("why", ""))
+            for row in keys.objects("coverage", required=False)
+        )
+        if "coverage" in content
+        else None,
+        faults=tuple(_fault(row) for row in keys.objects("faults", required=False)),
+        incidents=tuple(
+            Incident(
+                row.text("agent", ""),
+                row.number("time"),
+                row.text("call", ""),
+                row.text("verdict", ""),
+                row.text("action", ""),
+            )
+            for row in keys.objects("incidents", required=False)
+        ),
+    )
+
+
+def _fault(row: _Keys) -> Fault:
+    covered = row.content.get("covered", "")
+    if isinstance(covered, bool):
+        covered = "covered" if covered else "not covered"
+    return Fault(
+        kind=row.text("kind"),
+        agent=row.text("agent", ""),
+        begin=row.number("from"),
+        end=row.number("until"),
+        detail=row.text("detail", ""),
+        covered=str(covered),
+        proved=str(covered).startswith("covered"),
     )

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST_STATES = 6  # components of which each gets a plot of its own
 MOST_HEARD = 8  # names listed in one cell
+MOST_RECORDED = 12  # variables recorded besides of which each gets a plot
 
 
 @attrs.frozen
@@ -101,6 +102,8 @@ def render(run: Run, kpis: bool = False) -> str:
         legend=_legend(run),
         panels=_panels(run) if run.time.size else (),
         inputs=_inputs(run) if run.time.size else (),
+        recorded=_recorded(run) if run.time.size else (),
+        not_drawn=tuple(run.recorded)[MOST_RECORDED:],
         baseline=_baseline(run) if run.time.size else None,
         baseline_statement=wording.baseline_statement(run),
         kpis=kpis,
@@ -170,7 +173,10 @@ def _legend(run: Run) -> list[Key]:
         ]
     else:
         keys = [Key(f"agent {name}", *figures.line_look(i)) for i, name in enumerate(run.names)]
-    return [*keys, Key("leader s", BLACK, "dotted")]
+    faults = (
+        [Key("a fault holds", figures.FAULT, "solid", patch=True)] if run.summary.faults else []
+    )
+    return [*keys, Key("leader s", BLACK, "dotted"), *faults]
 
 
 def _panels(run: Run) -> tuple[Figure, ...]:
@@ -260,6 +266,15 @@ def _inputs(run: Run) -> tuple[Figure, ...]:
             panels.append(_svg(figures.sector_panel(run, k, f"sector-{k}", alt)))
         found.append(Figure("", what, statement, tuple(panels)))
     return tuple(found)
+
+
+def _recorded(run: Run) -> tuple[Markup, ...]:
+    """Draw what was recorded besides: signals from outside, variables of FMUs."""
+    panels = []
+    for k, (name, values) in enumerate(list(run.recorded.items())[:MOST_RECORDED]):
+        alt = wording.describe(run, values, f"Recorded variable {name}")
+        panels.append(_svg(figures.recorded_panel(run, name, f"recorded-{k}", alt)))
+    return tuple(panels)
 
 
 def _baseline(run: Run) -> Markup | None:

@@ -110,13 +110,17 @@ def _signals(dataset: Any, path: Path) -> dict[str, Any]:
             raise InputError(f"expected a variable '{name}' (found {found}); {AGAIN}", str(path))
     time = np.asarray(read_variable(dataset, "time", ("time",), path), dtype=float)
     present = {n: d for n, d in {**_SIGNALS, **_OPTIONAL}.items() if n in dataset.variables}
-    largest = max(dataset[name].size for name in present)
+    besides = _besides(dataset)
+    largest = max(dataset[name].size for name in (*present, *besides))
     rows = Rows(recorded(time), max(1, math.ceil(largest / LARGEST_VARIABLE)))
     signals = {n: rows.of(read_variable(dataset, n, d, path)) for n, d in present.items()}
     filled = np.flatnonzero(~np.all([_blank(signals[n]) for n in ("xhat", "u", "s")], axis=0))
     stop = int(filled[-1]) + 1 if filled.size else 0
     optional = dict.fromkeys(_OPTIONAL) | {
         n: v[:stop] for n, v in signals.items() if n in _OPTIONAL and not np.isnan(v).all()
+    }
+    others = {
+        clean(n): rows.of(read_variable(dataset, n, d, path))[:stop] for n, d in besides.items()
     }
     sizes = {dim: int(dataset.sizes[dim]) for dim in ("agent", "state", "input", "output")}
     labels = {dim: read_labels(dataset, dim, size) for dim, size in sizes.items()}
@@ -129,7 +133,21 @@ def _signals(dataset: Any, path: Path) -> dict[str, Any]:
         "time": rows.of(time)[:stop],
         **{n: signals[n][:stop] for n in _SIGNALS},
         **optional,
+        "recorded": {n: values for n, values in others.items() if not np.isnan(values).all()},
     }
+
+
+def _besides(dataset: Any) -> dict[str, tuple[str, ...]]:
+    """Return what was recorded besides the signals of the protocol, with its dimensions."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name, variable in dataset.data_vars.items():
+        dims = tuple(map(str, variable.dims))
+        if name not in {**_SIGNALS, **_OPTIONAL} and variable.dtype.kind in "fiub":
+            if set(dims) == {"time", "agent"}:
+                found[str(name)] = ("time", "agent")
+            elif dims == ("time",):
+                found[str(name)] = dims
+    return found
 
 
 def _attributes(dataset: Any) -> dict[str, Any]:

@@ -41,7 +41,8 @@ def tone(run: Run) -> str:
     """``good``, ``caution`` or ``bad``: the colour of the verdict, never the only sign of it."""
     if run.summary.verdict in ("diverged", "failed") or run.first_lost or negative(run):
         return "bad"
-    if run.summary.verdict == "converged" and run.complete and run.design.certified == "yes":
+    converged = run.summary.verdict == "converged" and run.complete
+    if converged and run.design.certified == "yes" and not run.summary.uncovered:
         return "good"
     return "caution" if run.design.certified != "no" else "bad"
 
@@ -107,8 +108,10 @@ def _proof(run: Run) -> str:
     what = "convergence is proved"
     if design.rate is not None and design.rate > 0:
         what += f" at {show(design.rate)} 1/s"
+    if run.summary.uncovered and design.certified != "no":
+        what += " for the nominal loop, not for all that this run used,"
     if design.certified == "yes":
-        return f"{what} without further conditions"
+        return what.rstrip(",") if run.summary.uncovered else f"{what} without further conditions"
     if design.certified == "conditional":
         parts = [
             f"“{a.name}” ({_DOUBT[a.status]})" for a in design.assumptions if a.status != "verified"
@@ -145,6 +148,11 @@ def advice(run: Run) -> str:
         return (
             "One simulated run is not a proof: another start, load or delay may behave otherwise. "
             "Change the gains, the pinning or the period until the certificate holds."
+        )
+    if run.summary.uncovered:
+        return (
+            f"The certificate does not cover {join(list(run.summary.uncovered))}: for that, this "
+            "run is evidence only. See what it covers below the certificate."
         )
     if design.certified == "conditional":
         worst = [a for a in design.assumptions if a.status == "contradicted"]
