@@ -68,7 +68,17 @@ def _run(arguments: argparse.Namespace) -> int:
             print(schedule.to_text())
         return DONE
     folder = arguments.out or Path("out") / scenario.name
-    result = run(scenario, folder, _progress, command=_command_line(arguments))
+    branch = None
+    if arguments.branch is not None:
+        if arguments.at is None:
+            raise InputError("--branch needs --at S, the time of a snapshot of that run")
+        if folder.resolve() == arguments.branch.resolve():
+            raise InputError("a branch needs a folder of its own: give --out DIR", str(folder))
+        branch = (arguments.branch, arguments.at)
+    command = _command_line(arguments)
+    result = run(
+        scenario, folder, _progress, command=command, resume=arguments.resume, branch=branch
+    )
     summary, certificate = result.summary, result.design.certificate
     if arguments.json:
         _print_json({**summary, "certified": certificate.certified, "folder": str(folder)})
@@ -396,6 +406,14 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
     run.add_argument("--seed", type=int, metavar="N", help="of every random number")
     run.add_argument("--json", action="store_true", help="print the summary as JSON")
+    begin = run.add_mutually_exclusive_group()
+    begin.add_argument(
+        "--resume", action="store_true", help="go on with the run in the folder, which ended early"
+    )
+    begin.add_argument(
+        "--branch", type=Path, metavar="DIR", help="go on from a snapshot of the run in DIR"
+    )
+    run.add_argument("--at", type=_seconds, metavar="S", help="time of that snapshot [s]")
     run.add_argument(
         "--schedule", action="store_true", help="print what a communication step does; do not run"
     )

@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
@@ -70,6 +71,13 @@ class Recorder:
         Of `Layout.shape`; ``time`` comes by itself.
     attributes : dict
         Global attributes of the file. ``complete`` is 0 until `finish`.
+    keep : int, optional
+        Go on with the file that is there, after so many of its rows.
+
+    Raises
+    ------
+    InputError
+        If the file to go on with cannot be read, has other variables or fewer rows.
     """
 
     def __init__(
@@ -79,6 +87,7 @@ class Recorder:
         network: Network,
         variables: tuple[str, ...],
         attributes: dict[str, Any],
+        keep: int | None = None,
     ) -> None:
         import h5netcdf
         import h5py
@@ -88,12 +97,41 @@ class Recorder:
         self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
         self._written = dict(self._taken)
         self._held = 0  # bytes
+        if keep is not None:
+            self._go_on(path, keep)
+            return
         # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
         self._disk = h5py.File(path, "w", track_order=True)
         self._file = h5netcdf.File(self._disk, "a")
         self._define(network, variables, attributes)
         # rows go past h5netcdf, which takes milliseconds for each write
         self._data = {name: self._disk[name] for name in self._blocks}
+
+    def _go_on(self, path: Path, keep: int) -> None:
+        import h5netcdf
+        import h5py
+
+        try:
+            self._disk = h5py.File(path, "r+", track_order=True)
+        except OSError as error:
+            raise InputError(f"cannot go on with these results: {error}", str(path)) from None
+        missing = [name for name in self._blocks if name not in self._disk]
+        if missing or len(self._disk["time"]) < keep:
+            found = f"no {missing[0]}" if missing else f"{len(self._disk['time'])} rows"
+            self._disk.close()
+            raise InputError(
+                f"cannot go on with these results: expected {keep} rows of "
+                f"{', '.join(self._blocks)} (there is {found})",
+                str(path),
+            )
+        self._file = h5netcdf.File(self._disk, "a")
+        self._file.attrs["complete"] = 0
+        self._data = {name: self._disk[name] for name in self._blocks}
+        for name, data in self._data.items():
+            if len(data) > keep:
+                data.resize(keep, axis=0)
+            if name != "x_baseline":  # that run is made anew
+                self._taken[name] = self._written[name] = keep
 
     def _define(
         self, network: Network, variables: tuple[str, ...], attributes: dict[str, Any]
@@ -199,6 +237,8 @@ class Thinned:
         Gets what is left of each block: arrays (r, …) by name.
     every : int
         k; 1 leaves all.
+    rows : int
+        Number of rows that came before.
 
     Attributes
     ----------
@@ -215,10 +255,10 @@ class Thinned:
     [3]
     """
 
-    def __init__(self, add: Callable[[dict[str, Array]], None], every: int) -> None:
+    def __init__(self, add: Callable[[dict[str, Array]], None], every: int, rows: int = 0) -> None:
         self._add, self._every = add, every
         self._last: dict[str, Array] = {}
-        self.rows = 0
+        self.rows = rows
 
     def __call__(self, values: dict[str, Array]) -> None:
         """Take a block."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +66,13 @@ class Snapshot:
             If the file is not a snapshot.
         """
         try:
-            with np.load(path, allow_pickle=False) as content:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
                 facts = json.loads(content["facts"].tobytes())
                 names = [name for name in content.files if name.startswith("array_")]
                 arrays = {name.removeprefix("array_"): content[name] for name in names}
                 count = sum(name.startswith("fmu_") for name in content.files)
                 states = tuple(content[f"fmu_{k}"].tobytes() for k in range(count))
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"this is not a snapshot of a run: {error}", str(path)) from None
         return cls(facts["k"], arrays, facts["counts"], states if facts["serialised"] else None)
 

@@ -328,6 +328,15 @@ class _Builder:
             self.problems.append(("$.scenario.tolerance", "expected a number > 0"))
         if self.tables.scenario.seed < 0:
             self.problems.append(("$.scenario.seed", "expected a whole number >= 0"))
+        head = self.tables.scenario
+        steps = head.snapshot / head.period if head.period > 0 else 0.0
+        if head.snapshot < 0 or abs(steps - round(steps)) > 1e-9 * max(1.0, steps):
+            self.problems.append(
+                (
+                    "$.scenario.snapshot",
+                    f"expected a multiple of the period (got {head.snapshot:g})",
+                )
+            )
         if self.tables.scenario.threads < 1:
             self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
 

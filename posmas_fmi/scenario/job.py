@@ -32,6 +32,7 @@ from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.faults import describe, make_episodes
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
+from posmas_fmi.scenario.resume import Beginning, branched, resumed, snapshots
 from posmas_fmi.scenario.schedule import make_schedule
 from posmas_fmi.scenario.verdict import summarise
 
@@ -103,6 +104,8 @@ def run(
     progress: Callable[[str], Progress | None] = lambda label: None,
     command: str = "",
     report: bool = True,
+    resume: bool = False,
+    branch: tuple[Path, float] | None = None,
 ) -> RunResult:
     """Run a scenario and write everything to a folder.
 
@@ -117,6 +120,11 @@ def run(
         For the manifest.
     report : bool, optional
         Whether to write report.html as well.
+    resume : bool
+        Go on with the run in the folder, which ended early: from its last snapshot, or, without
+        one, from its start.
+    branch : (Path, float), optional
+        Folder of another run and the time [s] of one of its snapshots, from which this one begins.
 
     Returns
     -------
@@ -129,11 +137,16 @@ def run(
         and what was recorded is kept.
     """
     if scenario.compare is not None:
+        if resume or branch:
+            raise InputError("a comparison cannot go on; run one of its controllers", "$.compare")
         from posmas_fmi.scenario.compare import run_comparison
 
         return run_comparison(scenario, folder, progress, command, report)
     make_instances(scenario, fmu_files(scenario), extras(scenario))  # its mistakes come first
-    return run_designed(scenario, make_design_of(scenario), folder, progress, command, report)
+    designed = make_design_of(scenario)
+    return run_designed(
+        scenario, designed, folder, progress, command, report, resume=resume, branch=branch
+    )
 
 
 def run_designed(
@@ -143,6 +156,8 @@ def run_designed(
     progress: Callable[[str], Progress | None] = lambda label: None,
     command: str = "",
     report: bool = True,
+    resume: bool = False,
+    branch: tuple[Path, float] | None = None,
 ) -> RunResult:
     """Run a scenario with a design that is there already; see `run`."""
     from posmas_fmi.report import write_report
@@ -156,6 +171,14 @@ def run_designed(
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     make_folder(folder)
+    told = manifest(scenario, files, choice, command)
+    beginning = Beginning()
+    if resume:
+        beginning = resumed(scenario, folder, told)
+    elif branch is not None:
+        beginning = branched(scenario, *branch)
+        told["branch"] = {"of": branch[0].name, "at": branch[1]}
+        scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
     for name in ("summary.json", "report.html", "results.csv"):
         (folder / name).unlink(missing_ok=True)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
@@ -164,7 +187,6 @@ def run_designed(
 
         facts |= proved(scenario.control)
     write_json(folder / "design.json", facts)
-    told = manifest(scenario, files, choice, command)
     write_json(folder / "manifest.json", told)
 
     def started(plant: FmuPlant) -> None:
@@ -172,7 +194,9 @@ def run_designed(
         write_json(folder / "manifest.json", told)
 
     began = time.perf_counter()
-    outcome, baseline = _simulate(scenario, designed, instances, choice, folder, progress, started)
+    outcome, baseline = _simulate(
+        scenario, designed, instances, choice, folder, progress, started, beginning
+    )
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
@@ -215,6 +239,7 @@ def _simulate(
     folder: Path,
     progress: Callable[[str], Progress | None],
     started: Callable[[FmuPlant], None],
+    beginning: Beginning,
 ) -> tuple[Outcome, Outcome | None]:
     """Run with the design, then once more without control for comparison."""
     recorded, baselines = tuple(scenario.record.variables), scenario.baseline
@@ -222,13 +247,15 @@ def _simulate(
     variables = (*recorded, "x_baseline") if with_baseline else recorded
     with (
         instances.start() as plant,
-        _recorder(scenario, designed.network, instances, folder, variables) as recorder,
+        _recorder(
+            scenario, designed.network, instances, folder, variables, beginning.keep
+        ) as recorder,
     ):
         started(plant)
         system = make_system(scenario, designed, instances)
         split, more = instances.recorded, _more(scenario, system.law)
 
-        thinned = Thinned(recorder.add, scenario.record.every)
+        thinned = Thinned(recorder.add, scenario.record.every, beginning.k)
 
         def record(times: Array, values: dict[str, Array]) -> None:
             thinned({"time": times, **split.named(values), **more(times)})
@@ -241,6 +268,7 @@ def _simulate(
             choice,
             scenario.settings.threads,
             variables=(*recorded, "extra"),
+            snapshots=snapshots(scenario, folder, beginning),
         )
         thinned.finish()
         recorder.flush()
@@ -392,6 +420,7 @@ def _recorder(
     instances: Instances,
     folder: Path,
     variables: tuple[str, ...],
+    keep: int | None = None,
 ) -> Recorder:
     agent, recorded = scenario.agent, instances.recorded
     layout = Layout(
@@ -408,7 +437,7 @@ def _recorder(
         "created_by": f"posmas-fmi {metadata.version('posmas-fmi')}",
     }
     names = (*variables, *layout.of_agents, *layout.of_run)
-    return Recorder(folder / "results.nc", layout, network, names, attributes)
+    return Recorder(folder / "results.nc", layout, network, names, attributes, keep)
 
 
 def manifest(

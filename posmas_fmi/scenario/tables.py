@@ -62,6 +62,9 @@ class ScenarioTable:
         How FMUs that are connected step: all at once with readings of the last communication
         point; agents first, then each component with what those before it show by then; or all
         at once, again and again until inputs and readings fit (the FMUs must give their states).
+    snapshot : float
+        Keep all state of the run every so many seconds, to go on from there (`--resume`,
+        `--branch`); 0: never.
     """
 
     name: str
@@ -72,6 +75,7 @@ class ScenarioTable:
     engine: Literal["auto", "c", "numpy"] = "auto"
     threads: int = 1
     coupling: Literal["jacobi", "gauss-seidel", "iterate"] = "jacobi"
+    snapshot: float = 0.0
 
 
 @attrs.frozen

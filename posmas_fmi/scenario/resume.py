@@ -1,0 +1,152 @@
+"""Going on with a run that ended early, or from a point of another run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from posmas_fmi.cosim.engine import Snapshots
+from posmas_fmi.cosim.snapshot import Snapshot, newest
+from posmas_fmi.errors import InputError
+from posmas_fmi.scenario.build import Scenario
+
+FOLDER = "snapshots"
+SAME = {  # what must not have changed in a run that goes on
+    "scenario_sha256": "the scenario",
+    "seed": "the seed",
+    "period": "the period",
+    "fmus": "the FMUs",
+    "inputs": "the input files",
+}
+
+
+@attrs.frozen(eq=False)
+class Beginning:
+    """Where a run begins.
+
+    Attributes
+    ----------
+    snapshot : Snapshot or None
+        None: at the start.
+    keep : int or None
+        Rows of the results that are kept; None: results of their own.
+    """
+
+    snapshot: Snapshot | None = None
+    keep: int | None = None
+
+    @property
+    def k(self) -> int:
+        """The communication point."""
+        return 0 if self.snapshot is None else self.snapshot.k
+
+
+def resumed(scenario: Scenario, folder: Path, manifest: dict[str, Any]) -> Beginning:
+    """Return where a run in a folder goes on: at its last snapshot, or at its start.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    folder : Path
+        With manifest.json, results.nc and perhaps snapshots.
+    manifest : dict
+        Of the run that is to go on.
+
+    Raises
+    ------
+    InputError
+        If there is no run, it is complete, or it was of something else.
+    """
+    before = _manifest(folder)
+    for key, what in SAME.items():
+        if before.get(key) != manifest[key]:
+            raise InputError(
+                f"{what} changed since that run ({key}); start it anew, or go on from one of its "
+                "snapshots with --branch DIR --at S and another --out",
+                str(folder / "manifest.json"),
+            )
+    rows, complete = _rows(folder / "results.nc")
+    if complete:
+        raise InputError("the run is complete: there is nothing to go on with", str(folder))
+    every = scenario.record.every
+    found = newest(folder / FOLDER, rows * every)
+    if found is None:
+        return Beginning()
+    snapshot = Snapshot.load(found)
+    return Beginning(snapshot, -(-snapshot.k // every))
+
+
+def branched(scenario: Scenario, folder: Path, at: float) -> Beginning:
+    """Return a beginning at a snapshot of another run.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With which the run goes on: agents, FMUs and network of the same sizes.
+    folder : Path
+        Of the other run.
+    at : float
+        Time of the snapshot [s].
+
+    Raises
+    ------
+    InputError
+        If there is none at that time, or the period is another.
+    """
+    before = _manifest(folder)
+    if before.get("period") != scenario.clock.h:
+        raise InputError(
+            f"that run has the period {before.get('period')} s (here it is {scenario.clock.h:g} s)",
+            str(folder),
+        )
+    k = round(at / scenario.clock.h)
+    path = folder / FOLDER / f"{k}.npz"
+    if not path.is_file():
+        known = sorted(int(p.stem) for p in (folder / FOLDER).glob("*.npz") if p.stem.isdigit())
+        times = ", ".join(f"{scenario.clock.time(n):g}" for n in known[:20]) or "none"
+        raise InputError(
+            f"there is no snapshot at {at:g} s (there is: {times}); [scenario] snapshot = S makes "
+            "one every S seconds",
+            str(folder),
+        )
+    return Beginning(Snapshot.load(path))
+
+
+def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapshots:
+    """Return where the run begins, and keep snapshots in its folder as the scenario wants."""
+    place = folder / FOLDER
+    every = round(scenario.settings.snapshot / scenario.clock.h)
+    if place.is_dir():  # those of a run that is replaced, and those of what is done again
+        for path in place.glob("*.npz"):
+            if not path.stem.isdigit() or int(path.stem) > beginning.k or beginning.keep is None:
+                path.unlink()
+    if every:
+        place.mkdir(exist_ok=True)
+
+    def keep(snapshot: Snapshot) -> None:
+        snapshot.save(place / f"{snapshot.k}.npz")
+
+    return Snapshots(beginning.snapshot, every, keep)
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / "manifest.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError("there is no run to go on with", str(folder)) from None
+    return content if isinstance(content, dict) else {}
+
+
+def _rows(path: Path) -> tuple[int, bool]:
+    """Rows of a result, and whether it is complete."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return len(file["time"]), bool(file.attrs["complete"])
+    except (OSError, KeyError):
+        return 0, False
