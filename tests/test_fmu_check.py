@@ -243,12 +243,12 @@ def test_any_beginning_of_a_library_is_read_or_refused(good: Path, size: int) ->
         read_image(entries(good)[name][:size])
 
 
-def test_a_folder_may_be_listed_twice(tmp_path: Path) -> None:
-    """Roberts of the Reference FMUs lists ``extra/`` twice: nothing is ambiguous about that."""
-    path = tmp_path / "twice.fmu"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", "<fmiModelDescription/>")
-        archive.writestr("extra/", "")
-        with pytest.warns(UserWarning, match="Duplicate name"):
-            archive.writestr("extra/", "")
-    assert [f.code for f in examine(path) if f.severity == "fatal"] == []
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_what_is_there_twice_with_the_same_content(good: Path, tmp_path: Path) -> None:
+    """Roberts of the Reference FMUs lists a folder and a file twice: nothing is ambiguous."""
+    twice: list[Entry] = [("extra/", b""), ("extra/a.xml", b"<a/>")]
+    path = packed(tmp_path / "twice.fmu", [*entries(good).items(), *twice, *twice])
+    findings = examine(path)
+    assert [(f.severity, f.place) for f in findings] == [("warning", "extra/a.xml")]
+    unpack(path, tmp_path / "out")
+    assert (tmp_path / "out" / "extra" / "a.xml").read_bytes() == b"<a/>"

@@ -169,11 +169,17 @@ def _entries(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[Finding]:
         yield _fatal("archive-overlap", "", "entries share the same bytes: this is a zip bomb")
     for entry in entries:
         yield from _entry(entry)
+    contents: dict[str, set[tuple[int, int]]] = {}
+    for entry in entries:
+        contents.setdefault(entry.filename, set()).add((entry.CRC, entry.file_size))
     for name, count in names.items():
-        if count > 1 and name != DESCRIPTION and not name.endswith("/"):
-            yield _fatal(
-                "archive-duplicate", name, f"it is in the archive {count} times: which one counts?"
-            )
+        if count == 1 or name == DESCRIPTION or name.endswith("/"):
+            continue
+        told = f"it is in the archive {count} times"
+        if len(contents[name]) == 1 and not name.startswith("binaries/"):
+            yield Finding("warning", "archive-duplicate", name, f"{told}, with the same content")
+        else:
+            yield _fatal("archive-duplicate", name, f"{told}: which one counts?")
     yield from _alike(names)
 
 
