@@ -51,7 +51,7 @@ def settable(
     """
     kept, findings = {}, []
     for name, value in values.items():
-        if about.structure.get(name) == value:
+        if name in about.structure and np.array_equal(about.structure[name], value):
             continue  # set when the instance was made
         why = _not_settable(about.variable(name))
         if why:
