@@ -378,9 +378,9 @@ def test_a_failing_instance_can_be_frozen(fmu: Path) -> None:
         outcome = one.run(record, None)
     x = np.concatenate(rows)[:, :, 0]
     assert outcome.ended == "complete"
-    assert [i.instance for i in outcome.incidents] == ["tank 2"]
+    assert [i.agent for i in outcome.incidents] == ["tank 2"]
     assert outcome.incidents[0].action == "frozen"
-    assert "cannot be set in Terminated" in outcome.incidents[0].reason
+    assert "cannot be set in Terminated" in outcome.incidents[0].cause
     last = int(np.flatnonzero(np.diff(x[:, 2]))[-1]) + 1
     assert 20 <= last < 60
     assert (np.diff(x[last:, 0]) != 0).all()

@@ -16,12 +16,10 @@ from posmas_fmi.cosim import native
 from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
-from posmas_fmi.cosim.fmus import Incident as CIncident
-from posmas_fmi.cosim.fmus import Report
+from posmas_fmi.cosim.fmus import Incident, Report
 from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
 from posmas_fmi.cosim.master import (
     DIVERGED,
-    Incident,
     Outcome,
     Progress,
     Record,
@@ -344,15 +342,18 @@ class Engine:
         self._sent = self._lost = 0
         self._conditions = system.timeline.at(0)
         self._incidents: Any = None
-        self._happened: list[Incident] = []
         self._start: Snapshot | None = None
         self._checkpoint: Callable[[Snapshot], None] | None = None
         self._checkpoint_every = 0
         self._largest_initial = 0.0
-        self._threads = max(1, min(threads, system.network.N, int(library.engine_threads())))
+        most = 1 if plant.isolated else int(library.engine_threads())
+        self._threads = max(1, min(threads, system.network.N, most))
         self._define(library)
         self._allocate()
         self._make_rows(variables)
+        plant.fmus.inputs = self._keep["inputs"]
+        if plant.goes_on:
+            self.freeze_failures()
 
     # ---- memory ---------------------------------------------------------------------------------
 
@@ -476,7 +477,7 @@ class Engine:
 
     def freeze_failures(self) -> None:
         """Let the run go on without instances that fail: neighbours keep their last messages."""
-        self._incidents = (CIncident * len(self._plant.fmus))()
+        self._incidents = (Incident * len(self._plant.fmus))()
         self._e.incident = ctypes.addressof(self._incidents)
         self._e.freezes = 1
 
@@ -518,7 +519,7 @@ class Engine:
 
     def run(self, record: RecordBlock | None, progress: Progress | None) -> Outcome:
         """Run to the end; see `run`."""
-        ended: Any = "complete"
+        ended: Any = ""
         reason = agent = ""
         try:
             if self._start is None:
@@ -530,19 +531,19 @@ class Engine:
             ended, reason = "cancelled", "interrupted"
             self._take(record)
         time_now = self._system.clock.time(self._e.k)
-        if self._e.ended == _FAILED:
+        if self._e.ended == _FAILED and not ended:
             try:
                 error = self._plant.fmus.error(self._reports[0].failure, time_now)
                 ended, reason, agent = "failed", str(error), error.agent
             except KeyboardInterrupt:  # during a call that goes through Python
                 ended, reason = "cancelled", "interrupted"
-        elif self._e.ended == _DIVERGED:
+        elif self._e.ended == _DIVERGED and not ended:
             agent, reason = self._diverged()
             ended = "diverged"
         elif self._halted:
-            ended, reason = "cancelled", "halted"
+            ended, reason = "cancelled", reason or "halted"
         self._plant.stepped_to(time_now)
-        return self._outcome(ended, reason, agent)
+        return self._outcome(ended or "complete", reason, agent)
 
     def _begin(self) -> None:
         """Read the FMUs at the start, from which the limit of divergence follows."""
@@ -663,6 +664,7 @@ class Engine:
             self._call()
             took = time.perf_counter() - began
             self._take(record)
+            self._plant.checkpoint()
             if progress is not None:
                 progress(e.k, clock.steps)
             due = every and e.k % every == 0 and stop is None
@@ -677,6 +679,7 @@ class Engine:
             log.warning("the system gives no %d threads; going on with one", self._e.threads)
             self._use_threads(1)
             self._run(ctypes.addressof(self._e))
+        self._plant.fmus.raise_interrupt()
         time_now = self._system.clock.time(self._e.k)
         self._plant.fmus.warn(self._reports[0], time_now)
         if self._incidents is not None and self._e.ended == _GOES_ON:
@@ -686,12 +689,9 @@ class Engine:
         """Take down which instances have failed in the last step of the slice."""
         assert self._incidents is not None
         for number, incident in enumerate(self._incidents):
-            if incident.call:
-                error = self._plant.fmus.error(incident, time_now)
-                name = self._plant.names[number]
-                self._happened.append(Incident(name, time_now, str(error), "frozen"))
-                log.warning("%s; it is frozen", error)
-                incident.call = 0
+            if incident.call and not self._plant.fmus.is_remote(number):  # they tell themselves
+                self._plant.fmus.freeze(incident, time_now)
+            incident.call = 0
         self._e.halt = int(self._halted)
 
     def _take(self, record: RecordBlock | None) -> None:
@@ -743,7 +743,7 @@ class Engine:
             lost=self._lost,
             reason=reason,
             failed_agent=agent,
-            incidents=tuple(self._happened),
+            incidents=tuple(self._plant.failures),
         )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,26 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import native
-from posmas_fmi.cosim.fmus import FmuLoop, Fmus, NativeMessages, PortMap, Whole
+from posmas_fmi.cosim.failure import Failure
+from posmas_fmi.cosim.fmus import FmuLoop, Fmus, Incident, NativeMessages, PortMap, Whole
+from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
+from posmas_fmi.cosim.worker.process import WorkerProcess, require
+from posmas_fmi.cosim.worker.proxy import RemoteFile, RemoteInstance
+from posmas_fmi.cosim.worker.remote import Remote
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
-from posmas_fmi.fmu.open import open_fmu
 from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
 from posmas_fmi.fmu.units import Conversion
 
 log = logging.getLogger(__name__)
 
-__all__ = ["FmuPlant", "PlantSpec", "PortMap", "converted"]
+__all__ = ["FmuPlant", "Isolation", "PlantSpec", "PortMap", "converted"]
+
+IN_PROCESS = Isolation("none")
 
 
 @attrs.frozen(eq=False)
@@ -67,12 +74,21 @@ class FmuPlant:
         Whether the readings of agents contain x.
     stop : float
         End of the run [s].
+    isolation : Isolation, optional
+        Which FMUs run in worker processes, and what happens when one fails. By default all run in
+        this process, and a failure is the end of the run.
 
     Attributes
     ----------
     names : tuple of str
         Of the instances.
     fmus : Fmus
+    isolated : bool
+        Whether some of them are in worker processes.
+    goes_on : bool
+        Whether the others go on when an FMU fails.
+    frozen : (instances,) array of bool
+        Which have failed and are not stepped any more, where the loop is not the engine's.
     input_at, reading_at : (instances + 1,) array of int
         Where inputs and readings of each instance begin.
     start_values : tuple of StartFinding
@@ -86,17 +102,24 @@ class FmuPlant:
         If an FMU cannot be loaded or initialised.
     """
 
-    def __init__(self, specs: Sequence[PlantSpec], shows_states: bool, stop: float) -> None:
+    def __init__(
+        self,
+        specs: Sequence[PlantSpec],
+        shows_states: bool,
+        stop: float,
+        isolation: Isolation = IN_PROCESS,
+    ) -> None:
         self.shows_states = shows_states
         self.names = tuple(spec.name for spec in specs)
         library = _compiled_loop()
         messages = None if library is None else NativeMessages(library)
         with ExitStack() as stack:
-            paths = dict.fromkeys(spec.fmu for spec in specs)
-            structure = {path: structure_of(path, specs) for path in paths}
+            pool = stack.enter_context(closing(WorkerPool(isolation, len(specs))))
             files = {
-                path: stack.enter_context(open_fmu(path, messages, structure=structure[path]))
-                for path in paths
+                path: stack.enter_context(
+                    _open(path, messages, isolation, pool, structure_of(path, specs))
+                )
+                for path in dict.fromkeys(spec.fmu for spec in specs)
             }
             known = {
                 (fmu, ports): converted(files[fmu].about, ports)
@@ -113,9 +136,8 @@ class FmuPlant:
                 for spec in specs
             )
             findings: list[StartFinding] = []
-            self._instances = [
-                stack.enter_context(_start(files[spec.fmu], spec, stop, findings)) for spec in specs
-            ]
+            of_each = [files[spec.fmu] for spec in specs]
+            self._instances = _start_all(of_each, specs, stop, findings, stack)
             self.start_values = tuple(findings)
             _tell(findings)
             self.fmus = Fmus(
@@ -124,9 +146,33 @@ class FmuPlant:
                 [spec.readings for spec in specs],
                 messages,
             )
+            self._remote = self._connect(isolation, pool, stack)
             self._release = stack.pop_all()
+        self.isolated = self._remote is not None
         self.input_at, self.reading_at = self.fmus.input_at, self.fmus.reading_at
-        self._loop = None if library is None else FmuLoop(self.fmus, library)
+        self.frozen = np.zeros(len(specs), dtype=bool)
+        self._fresh = np.zeros(len(specs), dtype=bool)  # which have been read by their last step
+        self.goes_on = isolation.on_failure != "stop" and library is not None
+        self._incidents = (Incident * len(specs))() if self.goes_on else None
+        self._loop = None
+        if library is not None:
+            self._loop = FmuLoop(self.fmus, library, self._incidents)
+
+    def _connect(self, isolation: Isolation, pool: WorkerPool, stack: ExitStack) -> Remote | None:
+        """Let the loops find the instances that are in worker processes."""
+        if not any(isinstance(one, RemoteInstance) for one in self._instances):
+            return None
+        inputs = [spec.inputs for spec in self._specs]
+        readings = [spec.readings for spec in self._specs]
+        remote = Remote(self._instances, inputs, readings, pool, isolation, self.fmus.failures)
+        stack.enter_context(closing(remote))
+        self.fmus.use(remote)
+        return remote
+
+    @property
+    def failures(self) -> Sequence[Failure]:
+        """What has failed so far."""
+        return self.fmus.failures
 
     @classmethod
     def of_agents(
@@ -137,6 +183,7 @@ class FmuPlant:
         outputs: PortMap,
         states: PortMap | None,
         stop: float,
+        isolation: Isolation = IN_PROCESS,
     ) -> FmuPlant:
         """Make the plants of agents that have the same ports and nothing wired.
 
@@ -150,18 +197,22 @@ class FmuPlant:
             Where the FMU shows x.
         stop : float
             End of the run [s].
+        isolation : Isolation, optional
         """
         readings = outputs if states is None else outputs + states
         whole = [
             attrs.evolve(spec, name=name, inputs=inputs, readings=readings)
             for name, spec in zip(names, specs, strict=True)
         ]
-        return cls(whole, states is not None, stop)
+        return cls(whole, states is not None, stop, isolation)
 
     def read(self, which: Whole, time: float, readings: Array) -> None:
         """Write the readings of some instances into those of all."""
         if self._loop is not None:
-            self._loop.read(which, time, readings)
+            before = readings.copy() if self.goes_on else readings
+            self._loop.read(which[~self._fresh[which]], time, readings)
+            self._fresh[which] = False
+            self._freeze(time, readings, before)
             return
         for number in which:
             instance, ports = self._instances[number], self._specs[number].readings
@@ -172,7 +223,12 @@ class FmuPlant:
     def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
         """Set the inputs of some instances and let them step."""
         if self._loop is not None:
+            self.fmus.inputs = inputs
+            before = readings.copy() if self.goes_on else readings
             self._loop.step(which, t, h, inputs, readings)
+            if self._remote is not None:
+                self._fresh[which] = self._remote.is_remote[which] != 0
+            self._freeze(float(t[0]), readings, before)
             return
         for number, begin, length in zip(which, t, h, strict=True):
             instance, ports = self._instances[number], self._specs[number].inputs
@@ -180,6 +236,24 @@ class FmuPlant:
             values = inputs[at] * np.array(ports.scale) + np.array(ports.offset)
             instance.write(instance.file.ports(ports.variables), values)
             instance.do_step(float(begin), float(length))
+
+    def _freeze(self, time: float, readings: Array, before: Array) -> None:
+        """Leave instances that have failed as they were."""
+        if self._incidents is None:
+            return
+        for number, incident in enumerate(self._incidents):
+            if incident.call:
+                if not self.fmus.is_remote(number):  # they tell themselves
+                    self.fmus.freeze(incident, time)
+                self.frozen[number] = True
+                at = slice(self.reading_at[number], self.reading_at[number + 1])
+                readings[at] = before[at]
+                incident.call = 0
+
+    def checkpoint(self) -> None:
+        """Save states to restart from, if it is time."""
+        if self._remote is not None:
+            self._remote.checkpoint()
 
     def save(self, which: Whole) -> Any:
         """Keep the states of some instances.
@@ -189,7 +263,12 @@ class FmuPlant:
         FmuCallError
             If an FMU cannot give its state.
         """
-        return [(number, self._instances[number].get_state()) for number in which]
+        return [(number, self._save(int(number))) for number in which if not self.frozen[number]]
+
+    def _save(self, number: int) -> Any:
+        if self._remote is not None and self._remote.is_remote[number]:
+            return self._remote.save(number)
+        return self._instances[number].get_state()
 
     def serialise(self) -> tuple[bytes, ...] | None:
         """Return the states of all instances as bytes; None if an FMU cannot give its own."""
@@ -219,7 +298,12 @@ class FmuPlant:
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
         for number, state in saved:
-            self._instances[number].set_state(state)
+            if self.frozen[number]:
+                continue
+            if self._remote is not None and self._remote.is_remote[number]:
+                self._remote.restore(number, state)
+            else:
+                self._instances[number].set_state(state)
 
     def stepped_to(self, time: float) -> None:
         """Note that the engine has taken the instances to a time [s]."""
@@ -244,14 +328,70 @@ def _compiled_loop() -> ctypes.CDLL | None:
         return None
 
 
-def _start(
-    file: FmuFile, spec: PlantSpec, stop: float, findings: list[StartFinding]
-) -> FmuInstance:
-    instance = file.instantiate(spec.name)
-    values, refused = settable(file.about, _existing(file, spec.values), spec.name)
+def _open(
+    path: Path, messages: NativeMessages | None, isolation: Isolation, pool: WorkerPool
+) -> FmuFile:
+    """Open an FMU, to run here or in worker processes."""
+    if isolation.mode == "none" or not isolation.separates(path):
+        return FmuFile(path, messages)
+    try:
+        require()
+    except BuildError as error:
+        if isolation.mode == "process":
+            raise
+        log.warning("%s runs in this process: %s", path.name, error)
+        return FmuFile(path, messages)
+    return RemoteFile(path, pool.place)
+
+
+def _start_all(
+    files: Sequence[FmuFile],
+    specs: Sequence[PlantSpec],
+    stop: float,
+    findings: list[StartFinding],
+    stack: ExitStack,
+) -> list[FmuInstance]:
+    """Make and initialise all instances; worker processes do it side by side."""
+    instances: list[FmuInstance] = []
+    told: dict[FmuInstance, list[StartFinding]] = {}
+    there: dict[WorkerProcess, list[tuple[RemoteInstance, PlantSpec]]] = {}
+    for file, spec in zip(files, specs, strict=True):
+        if isinstance(file, RemoteFile):
+            instance: FmuInstance = file.prepare(spec.name)
+            assert isinstance(instance, RemoteInstance)
+            there.setdefault(instance.worker, []).append((instance, spec))
+        else:
+            instance = stack.enter_context(file.instantiate(spec.name))
+            told[instance] = _initialise(instance, spec, stop)
+        instances.append(instance)
+
+    def make(worker: WorkerProcess) -> None:
+        for one, spec in there[worker]:
+            one.make(worker)
+            told[one] = _initialise(one, spec, stop)
+
+    with ThreadPoolExecutor(max(len(there), 1)) as threads:
+        made = [threads.submit(make, worker) for worker in there]
+        try:
+            for one in made:
+                one.result()
+        except BaseException:
+            for worker in there:  # so that the others need not be waited for
+                worker.kill()
+            raise
+    for worker in there:
+        for one_there, _ in there[worker]:
+            stack.enter_context(one_there)
+    for instance in instances:
+        findings += told[instance]
+    return instances
+
+
+def _initialise(instance: FmuInstance, spec: PlantSpec, stop: float) -> list[StartFinding]:
+    given = _existing(instance.file, spec.values)
+    values, refused = settable(instance.file.about, given, spec.name)
     instance.initialise(values, stop=stop, tolerance=spec.tolerance)
-    findings += [*refused, *read_back(instance, values)]
-    return instance
+    return [*refused, *read_back(instance, values)]
 
 
 def _tell(findings: list[StartFinding]) -> None:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import ctypes
 import logging
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from typing import Protocol as Interface
 
 import attrs
 import numpy as np
 
+from posmas_fmi.cosim.failure import Action, Failure
 from posmas_fmi.cosim.served import Served, needs_python
 from posmas_fmi.errors import FmuCallError, FmuError
-from posmas_fmi.expression import Array
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
 from posmas_fmi.fmu.variables import Ports
+
+if TYPE_CHECKING:
+    from posmas_fmi.expression import Array
 
 _LOG = logging.getLogger(__name__)
 
@@ -57,6 +61,11 @@ class PortMap:
             self.units + other.units,
             self.place,
         )
+
+    def values_of(self, values: Array) -> dict[str, float]:
+        """Return what protocol values are to the FMU, by variable."""
+        ports = zip(self.variables, values, self.scale, self.offset, strict=True)
+        return {name: float(v * scale + offset) for name, v, scale, offset in ports}
 
     @property
     def converts(self) -> bool:
@@ -126,9 +135,9 @@ class Report(ctypes.Structure):
     _fields_ = (("failure", Incident), ("warning", Incident), ("warnings", _int))
 
 
-_CALLS = ("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep")
+_CALLS = ("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep", "")
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
-DIED, DEADLINE = 8, 9  # of an FMU in another process
+DIED, DEADLINE, INTERRUPTED = 8, 9, 10  # of an FMU in another process
 
 
 def call_name(call: int, fmi: int) -> str:
@@ -206,6 +215,30 @@ class NativeMessages:
 # ---- the instances -------------------------------------------------------------------------------
 
 
+class Elsewhere(Interface):
+    """Instances in other processes.
+
+    Attributes
+    ----------
+    address : int
+        Of the structure `Remote` in csrc/fmus.h.
+    is_remote : (n,) array of int
+        Of each instance.
+    interrupted : bool
+        Whether Ctrl-C came while one was waited for.
+    """
+
+    is_remote: Whole
+    interrupted: bool
+
+    @property
+    def address(self) -> int:
+        """Of the structure."""
+
+    def error(self, incident: Incident) -> FmuCallError:
+        """Return what ended the run as an error, and note it."""
+
+
 class Fmus:
     """FMU instances with their ports: the agents' first, then those that are no agents.
 
@@ -222,6 +255,10 @@ class Fmus:
     ----------
     input_at, reading_at : (n + 1,) array of int
         Where the inputs and readings of each instance begin among those of all.
+    inputs : array or None
+        Those of all, where the loop that is running has them.
+    failures : list of Failure
+        Those that have been told so far.
     """
 
     def __init__(
@@ -234,6 +271,9 @@ class Fmus:
         self._instances = list(instances)
         self._messages = messages
         self._inputs, self._readings = tuple(inputs), tuple(readings)
+        self.inputs: Array | None = None
+        self._remote: Elsewhere | None = None
+        self.failures: list[Failure] = []
         self._keep: list[Any] = []  # what the structures point to
         self._served = Served()
         kinds = list(zip((i.file for i in instances), inputs, readings, strict=True))
@@ -265,17 +305,26 @@ class Fmus:
     def __len__(self) -> int:
         return len(self._instances)
 
-    def replace(self, number: int, instance: FmuInstance) -> None:
-        """Put a fresh instance of the same file in the place of one that has failed."""
-        self._instances[number] = instance
-        ports = self._inputs[number], self._readings[number]
-        self._components[number] = self._component(instance.file, *ports, instance)
-
     def _component(
         self, file: FmuFile, inputs: PortMap, readings: PortMap, instance: FmuInstance
     ) -> int:
         ports = (file.ports(one.variables) for one in (inputs, readings))
         return self._served.add(instance) if needs_python(file, *ports) else instance.component
+
+    def use(self, remote: Elsewhere) -> None:
+        """Step some of the instances in other processes."""
+        self._remote = remote
+        self.structure.remote = remote.address
+        self.structure.is_remote = remote.is_remote.ctypes.data
+
+    def is_remote(self, number: int) -> bool:
+        """Whether an instance is in another process."""
+        return self._remote is not None and bool(self._remote.is_remote[number])
+
+    def raise_interrupt(self) -> None:
+        """Pass on the Ctrl-C that came while another process was waited for."""
+        if self._remote is not None and self._remote.interrupted:
+            raise KeyboardInterrupt
 
     def _bind(self, file: FmuFile, inputs: PortMap, readings: PortMap) -> _Binding:
         if needs_python(file, file.ports(inputs.variables), file.ports(readings.variables)):
@@ -347,10 +396,43 @@ class Fmus:
             _LOG.warning("%d more calls of FMUs returned Warning", report.warnings - 1)
 
     def error(self, failure: Incident, time: float) -> FmuCallError:
-        """Return what went wrong as an error; the run stood at `time` [s].
+        """Return what ended the run as an error, and note it; the run stood at `time` [s].
 
         What a call through Python raised, and is no `FmuError`, is raised here.
         """
+        if self._remote is not None and self._remote.is_remote[failure.instance]:
+            return self._remote.error(failure)
+        error = self._error(failure, time)
+        self.failures.append(self._failure(failure, error, "stopped"))
+        return error
+
+    def freeze(self, incident: Incident, time: float) -> None:
+        """Note that an instance of this process has failed and is not stepped any more."""
+        failure = self._failure(incident, self._error(incident, time), "frozen")
+        self.failures.append(failure)
+        _LOG.warning("%s; it is frozen", failure)
+
+    def _failure(self, incident: Incident, error: FmuCallError, action: Action) -> Failure:
+        instance = self._instances[incident.instance]
+        return Failure(
+            agent=instance.name,
+            fmu=instance.file.path.name,
+            call=call_name(incident.call, instance.file.version),
+            time=error.time,
+            inputs=self._inputs_of(incident.instance),
+            cause=error.message.removesuffix(f" (at time {error.time:g} s)"),
+            action=action,
+            status=incident.status or None,
+        )
+
+    def _inputs_of(self, number: int) -> dict[str, float]:
+        """Return what an instance was given for the present step, as it takes it."""
+        if self.inputs is None:
+            return {}
+        values = self.inputs[self.input_at[number] : self.input_at[number + 1]]
+        return self._inputs[number].values_of(values)
+
+    def _error(self, failure: Incident, time: float) -> FmuCallError:
         instance, function, messages = self._call_of(failure, time)
         raised = self._served.failure(instance)
         if isinstance(raised, FmuCallError):
@@ -373,6 +455,8 @@ class Fmus:
         if function != "DoStep":
             function += "Real" if instance.file.version == 2 else "Float64"
         messages: Sequence[str] = instance.messages
+        if self.is_remote(incident.instance):
+            return instance, function, messages
         if self._messages is not None:
             messages = self._messages.since(instance.key, incident.said)
         return instance, function, messages
@@ -386,13 +470,16 @@ class FmuLoop:
     fmus : Fmus
     library : ctypes.CDLL
         Of `posmas_fmi.cosim.native.fmus_sources`.
+    incidents : array of Incident, optional
+        One for each instance: those that fail are noted there, and the others go on.
     """
 
-    def __init__(self, fmus: Fmus, library: ctypes.CDLL) -> None:
+    def __init__(self, fmus: Fmus, library: ctypes.CDLL, incidents: Any = None) -> None:
         self._fmus = fmus
+        self._incidents = None if incidents is None else ctypes.addressof(incidents)
         self._step, self._read = library.fmus_step_all, library.fmus_read_all
-        self._step.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 6]
-        self._read.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 3]
+        self._step.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 7]
+        self._read.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 4]
         self._step.restype = self._read.restype = None
         self._scratch = np.zeros(fmus.room)
 
@@ -412,7 +499,8 @@ class FmuLoop:
         Raises
         ------
         FmuCallError
-            For the first FMU that fails; those after it have not stepped.
+            For the first FMU that fails, unless incidents are noted; those after it have not
+            stepped.
         """
         report = Report()
         self._step(
@@ -425,8 +513,9 @@ class FmuLoop:
             readings.ctypes.data,
             self._scratch.ctypes.data,
             ctypes.addressof(report),
+            self._incidents,
         )
-        self._check(report, float(t[0]))
+        self._check(report, float(t[0]) if len(t) else 0.0)
 
     def read(self, which: Whole, t: float, readings: Array) -> None:
         """Write the readings of some instances into those of all.
@@ -444,10 +533,12 @@ class FmuLoop:
             readings.ctypes.data,
             self._scratch.ctypes.data,
             ctypes.addressof(report),
+            self._incidents,
         )
         self._check(report, t)
 
     def _check(self, report: Report, time: float) -> None:
+        self._fmus.raise_interrupt()
         self._fmus.warn(report, time)
         if report.failure.call:
             raise self._fmus.error(report.failure, time)

@@ -14,6 +14,7 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.channel import Channel, Mailbox
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
 from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
+from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.law import Heard, Law, Weights
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.wiring import Whole, Wiring
@@ -192,27 +193,6 @@ class State:
 
 
 @attrs.frozen(eq=False)
-class Incident:
-    """An instance that failed while the run went on.
-
-    Attributes
-    ----------
-    instance : str
-        Name of the agent or component.
-    time : float
-        When [s].
-    reason : str
-    action : str
-        What was done: ``frozen`` or ``restarted``, with details.
-    """
-
-    instance: str
-    time: float
-    reason: str
-    action: str
-
-
-@attrs.frozen(eq=False)
 class Outcome:
     """How a run ended.
 
@@ -234,8 +214,8 @@ class Outcome:
     reason : str
         Empty for a complete run.
     failed_agent : str
-    incidents : tuple of Incident
-        Instances that failed while the run went on.
+    incidents : tuple of Failure
+        FMUs that failed, and what was done about it.
     """
 
     ended: Literal["complete", "diverged", "failed", "cancelled"]
@@ -250,7 +230,7 @@ class Outcome:
     lost: int
     reason: str = ""
     failed_agent: str = ""
-    incidents: tuple[Incident, ...] = ()
+    incidents: tuple[Failure, ...] = ()
 
 
 def simulate(
@@ -370,6 +350,7 @@ class Run:
             lost=state.mailbox.lost,
             reason=reason,
             failed_agent=agent,
+            incidents=tuple(self.plant.failures),
         )
 
     def _loop(self) -> None:
@@ -390,7 +371,8 @@ class Run:
             self._step(k)
             self._remember(t, k)
             state.k = k + 1
-            begins = np.flatnonzero((k + 1) % system.every == 0)
+            begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
+            self.plant.checkpoint()
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
 
@@ -450,7 +432,7 @@ class Run:
         system, state, every = self.system, self.state, self.system.every[: len(sent)]
         state.u, state.applied = state.u.copy(), state.applied.copy()
         for period in np.unique(every):
-            mine = (every == period) & (k % period == 0)
+            mine = (every == period) & (k % period == 0) & ~self.plant.frozen[: len(every)]
             if not mine.any():
                 continue
             h = int(period) * system.clock.period / TICKS_PER_SECOND
@@ -507,9 +489,10 @@ class Run:
         """Step stage after stage; inputs are made of `latest`, which is brought up to date."""
         system, state, clock = self.system, self.state, self.system.clock
         for stage in system.stages:
-            begins = stage[k % system.every[stage] == 0]
+            alive = stage[~self.plant.frozen[stage]]
+            begins = alive[k % system.every[alive] == 0]
             self._set_inputs(begins, latest)
-            ends = stage[(k + 1) % system.every[stage] == 0]
+            ends = alive[(k + 1) % system.every[alive] == 0]
             if not len(ends):
                 continue
             every = system.every[ends]
@@ -517,7 +500,7 @@ class Run:
             h = every * clock.period / TICKS_PER_SECOND
             self.plant.step(ends, t, h, state.inputs, latest)
             state.k = k + 1  # a reading that fails belongs to the next point
-            self.plant.read(ends, clock.time(k + 1), latest)
+            self.plant.read(ends[~self.plant.frozen[ends]], clock.time(k + 1), latest)
             state.k = k
         return latest
 
@@ -533,7 +516,8 @@ class Run:
 
     def _remember(self, t: float, k: int) -> None:
         state, system = self.state, self.system
-        ends = (k + 1) % system.every[: system.network.N] == 0
+        N = system.network.N
+        ends = ((k + 1) % system.every[:N] == 0) & ~self.plant.frozen[:N]
         state.memory = np.where(ends[:, None], state.pending, state.memory)
         state.leader = system.law.leader_step(t, system.clock.h, state.leader)
 

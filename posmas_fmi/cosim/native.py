@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import os
 import tomllib
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import attrs
 
 from posmas_fmi import resources
+from posmas_fmi.cosim.loading import load
 from posmas_fmi.errors import BuildError
 from posmas_fmi.fmu.build import cache_folder, write
 from posmas_fmi.fmu.compile import FLAGS, host, shared_library
 from posmas_fmi.fmu.plant import agent_functions
 from posmas_fmi.fmu.positive_agent import functions_header
+
+__all__ = [
+    "Sources",
+    "build_shipped",
+    "engine_sources",
+    "fmus_sources",
+    "library",
+    "load",
+    "worker_sources",
+]
 
 _HERE = Path(__file__).parent / "csrc"
 _EXPORT = Path(resources.__file__).parent / "fmu" / "csrc" / "export.h"
@@ -107,21 +116,6 @@ def library(sources: Sources, cache_to: Path | None = None) -> Path:
     path = folder / name
     write(path, sources.build())
     return path
-
-
-@cache
-def load(path: Path) -> ctypes.CDLL:
-    """Load a library; it stays loaded, for FMUs hold addresses in it.
-
-    Raises
-    ------
-    BuildError
-        If it cannot be loaded here.
-    """
-    try:
-        return ctypes.CDLL(str(path))
-    except OSError as error:
-        raise BuildError(f"the library cannot be loaded: {error}", str(path)) from error
 
 
 def build_shipped(models_dir: Path, out_dir: Path) -> list[Path]:

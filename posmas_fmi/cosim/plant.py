@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from typing import Protocol as Interface
 
@@ -10,9 +10,11 @@ import attrs
 import numpy as np
 
 from posmas_fmi.agent import Agent
+from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.expression import Array
 
 Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
+Truths = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 class Plant(Interface):
@@ -27,11 +29,18 @@ class Plant(Interface):
         Where those of each instance begin.
     shows_states : bool
         Whether readings contain x.
+    frozen : (instances,) array of bool
+        Which have failed and are not stepped any more: their readings stay.
     """
 
     input_at: Whole
     reading_at: Whole
     shows_states: bool
+    frozen: Truths
+
+    @property
+    def failures(self) -> Sequence[Failure]:
+        """What has failed so far."""
 
     def read(self, which: Whole, time: float, readings: Array) -> None:
         """Write the readings of some instances, which stand at a time [s]."""
@@ -48,6 +57,9 @@ class Plant(Interface):
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
 
+    def checkpoint(self) -> None:
+        """Save states for later, if it is time; called between steps."""
+
     def close(self) -> None:
         """Release what the plant holds."""
 
@@ -58,7 +70,13 @@ class _Agents:
     x: Array
     shows_states = True
 
+    @property
+    def failures(self) -> Sequence[Failure]:
+        """Nothing fails here."""
+        return ()
+
     def _sizes(self, n: int, p: int, width: int) -> None:
+        self.frozen = np.zeros(n, dtype=bool)
         self.input_at = p * np.arange(n + 1)
         self.reading_at = width * np.arange(n + 1)
 
@@ -69,6 +87,9 @@ class _Agents:
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
         self.x = saved.copy()
+
+    def checkpoint(self) -> None:
+        """Nothing to save."""
 
     def close(self) -> None:
         """Nothing to release."""

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from posmas_fmi.errors import FmuCallError, FmuError
-from posmas_fmi.expression import Array
 from posmas_fmi.fmu.callbacks import said
 from posmas_fmi.fmu.live import free_instance
 from posmas_fmi.fmu.state import FmuState
 from posmas_fmi.fmu.variables import WHOLE, Group, Ports, Variable, pointer
 
 if TYPE_CHECKING:
+    from posmas_fmi.expression import Array
     from posmas_fmi.fmu.file import FmuFile as FmuFile
 
 _LOG = logging.getLogger(__name__)

@@ -7,14 +7,16 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
 
 from posmas_fmi.errors import FmuError
-from posmas_fmi.expression import Array
 from posmas_fmi.fmu.model import element_names
+
+if TYPE_CHECKING:
+    from posmas_fmi.expression import Array
 
 REAL = frozenset({"Real", "Float64", "Float32"})
 WHOLE = frozenset(

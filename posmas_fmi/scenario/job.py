@@ -201,16 +201,6 @@ def run_designed(
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
         summary["faults"] = describe(list(scenario.faults), designed.network, scenario.clock)
-    if outcome.incidents:
-        summary["incidents"] = [
-            {
-                "agent": incident.instance,
-                "time": incident.time,
-                "verdict": incident.reason,
-                "action": incident.action,
-            }
-            for incident in outcome.incidents
-        ]
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
         keys = ("verdict", "tracking_error_final", "min_state")

@@ -8,8 +8,10 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
 from posmas_fmi.cosim.wiring import Whole, Wiring
+from posmas_fmi.cosim.worker.minder import Limits
+from posmas_fmi.cosim.worker.process import Patience
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.about import About, read_about
@@ -83,6 +85,7 @@ class Instances:
         End of the run [s].
     every : (instances,) array of int
         Period of each in communication steps.
+    isolation : Isolation
     """
 
     specs: tuple[PlantSpec, ...]
@@ -91,6 +94,7 @@ class Instances:
     shows_states: bool
     stop: float
     every: Whole
+    isolation: Isolation
 
     def start(self) -> FmuPlant:
         """Load and initialise them.
@@ -102,7 +106,7 @@ class Instances:
         FmuError
             If one cannot be loaded or initialised.
         """
-        return FmuPlant(self.specs, self.shows_states, self.stop)
+        return FmuPlant(self.specs, self.shows_states, self.stop, self.isolation)
 
 
 def make_instances(
@@ -160,6 +164,27 @@ def make_instances(
         shows_states,
         scenario.clock.time(scenario.clock.steps),
         every,
+        _isolation(scenario),
+    )
+
+
+def _isolation(scenario: Scenario) -> Isolation:
+    plant = scenario.plant
+    problems = [
+        (f"$.plant.{key}", f"expected a number above 0 (got {value:g})")
+        for key, value in (("deadline", plant.deadline), ("memory", plant.memory))
+        if value <= 0
+    ]
+    if plant.workers < 0:
+        problems.append(("$.plant.workers", f"expected 0 or more (got {plant.workers})"))
+    if problems:
+        raise ScenarioError(tuple(problems), str(scenario.path))
+    return Isolation(
+        plant.isolation,
+        plant.workers,
+        plant.on_failure,
+        Limits(memory=plant.memory),
+        Patience(step=plant.deadline, start=max(plant.deadline, Patience().start)),
     )
 
 

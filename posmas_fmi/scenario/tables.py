@@ -221,6 +221,17 @@ class PlantTable:
         FMU variables that are recorded in ``results.nc`` besides.
     tolerance : float, optional
         Relative, for the solver inside the FMU.
+    isolation : {"auto", "process", "none"}
+        Whether FMUs, those of components as well, run in worker processes; auto: those that this
+        installation has not built.
+    on_failure : {"stop", "freeze", "restart"}
+        What happens to the rest when an FMU fails.
+    deadline : float
+        For one call of an FMU in a worker process [s].
+    memory : float
+        Of a worker process [GiB].
+    workers : int
+        Number of worker processes; 0: as many as processors.
     """
 
     fmu: str = "positive_agent"
@@ -234,6 +245,11 @@ class PlantTable:
     measured: dict[str, str] = attrs.field(factory=dict)
     record: list[str] = attrs.field(factory=list)
     tolerance: float | None = None
+    isolation: Literal["auto", "process", "none"] = "auto"
+    on_failure: Literal["stop", "freeze", "restart"] = "stop"
+    deadline: float = 10.0
+    memory: float = 4.0
+    workers: int = 0
 
 
 @attrs.frozen

@@ -41,7 +41,7 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
     ]
     return {
         "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
-        "reason": outcome.reason,
+        "reason": outcome.reason or _frozen_reason(outcome),
         "agents": agents,
         "tracking_error_final": _finite(outcome.tracking_error.max()),
         "estimation_error_final": _finite(outcome.estimation_error.max()),
@@ -50,6 +50,7 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         "time": outcome.time,
         "messages_sent": outcome.messages,
         "messages_lost": outcome.lost,
+        "incidents": [failure.to_dict() for failure in outcome.incidents],
     }
 
 
@@ -59,6 +60,8 @@ def _status(outcome: Outcome, k: int, name: str, tolerance: float) -> str:
         return "diverged"
     if outcome.ended == "failed" and outcome.failed_agent == name:
         return "failed"
+    if name in _frozen(outcome):
+        return "frozen"
     if outcome.min_state[k] < NEGATIVE:
         return "positivity lost"
     return "converged" if error <= tolerance else "not converged"
@@ -70,7 +73,18 @@ def _verdict(outcome: Outcome, statuses: list[str]) -> str:
     for status in ("diverged", "positivity lost", "not converged"):
         if status in statuses:
             return status
-    return "converged"
+    return "not converged" if "frozen" in statuses else "converged"
+
+
+def _frozen_reason(outcome: Outcome) -> str:
+    names = _frozen(outcome)
+    return f"frozen after a failure of the FMU: {', '.join(names)}" if names else ""
+
+
+def _frozen(outcome: Outcome) -> list[str]:
+    """Names of the instances that failed and stayed as they were."""
+    names = (failure.agent for failure in outcome.incidents if failure.action == "frozen")
+    return list(dict.fromkeys(names))
 
 
 def _finite(value: Any) -> float | None:

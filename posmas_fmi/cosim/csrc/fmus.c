@@ -164,10 +164,21 @@ int incident_before(const Incident *a, const Incident *b)
 
 /* ---- many instances in one call, for a loop that is not in C --------------------------------- */
 
+/* Whether to go on with other instances after one that failed: where `incidents`, one of each
+ * instance, are wanted. NULL: the first failure ends it. */
+static int goes_on(Incident *incidents, int64_t instance, Report *report)
+{
+    if (!incidents)
+        return 0;
+    incidents[instance] = report->failure;
+    report->failure.call = CALL_NONE;
+    return 1;
+}
+
 /* Step the instances numbered `which`, each from its own time over its own step. */
 EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const double *t,
                           const double *h, const double *inputs, double *readings,
-                          double *scratch, Report *report)
+                          double *scratch, Report *report, Incident *incidents)
 {
     int64_t posted = 0;
     for (int64_t k = 0; k < n; k++) {
@@ -175,7 +186,8 @@ EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const 
         if (fmus_is_remote(f, i)) {
             f->remote->post(f->remote->context, i, t[k], h[k], inputs + f->input_at[i]);
             posted++;
-        } else if (!fmus_step(f, i, t[k], h[k], inputs + f->input_at[i], scratch, report)) {
+        } else if (!fmus_step(f, i, t[k], h[k], inputs + f->input_at[i], scratch, report) &&
+                   !goes_on(incidents, i, report)) {
             break;
         }
     }
@@ -183,15 +195,17 @@ EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const 
         return;
     f->remote->send(f->remote->context);
     for (int64_t k = 0; k < n; k++)
-        if (fmus_is_remote(f, which[k]))
-            f->remote->wait(f->remote->context, which[k], readings + f->reading_at[which[k]],
-                            report);
+        if (fmus_is_remote(f, which[k]) &&
+            !f->remote->wait(f->remote->context, which[k], readings + f->reading_at[which[k]],
+                             report))
+            goes_on(incidents, which[k], report);
 }
 
 EXPORT void fmus_read_all(const Fmus *f, const int64_t *which, int64_t n, double *readings,
-                          double *scratch, Report *report)
+                          double *scratch, Report *report, Incident *incidents)
 {
     for (int64_t k = 0; k < n; k++)
-        if (!fmus_read(f, which[k], readings + f->reading_at[which[k]], scratch, report))
+        if (!fmus_read(f, which[k], readings + f->reading_at[which[k]], scratch, report) &&
+            !goes_on(incidents, which[k], report))
             return;
 }

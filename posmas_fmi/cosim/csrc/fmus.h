@@ -40,7 +40,8 @@ typedef enum {
     CALL_GET,
     CALL_NOT_FINITE,      /* a value that was read */
     CALL_WORKER_DIED,     /* the process that runs the FMU */
-    CALL_DEADLINE         /* it did not answer in time */
+    CALL_DEADLINE,        /* it did not answer in time */
+    CALL_INTERRUPTED      /* the user wants an end; it is not waited for any more */
 } Call;
 
 /* Which call was not right. */

@@ -144,6 +144,8 @@ static int64_t await(Workers *r, RemoteInstance *x)
         if (has_ended(w)) /* what it did before it ended counts */
             return __atomic_load_n(done, __ATOMIC_ACQUIRE) == posted ? CALL_NONE
                                                                      : CALL_WORKER_DIED;
+        if (r->interrupted && r->interrupted())
+            return CALL_INTERRUPTED;
         const int64_t calls = __atomic_load_n(&head->calling.begun, __ATOMIC_ACQUIRE);
         if (calls != begun) {
             begun = calls;
@@ -186,6 +188,10 @@ static int remote_wait(void *context, int64_t i, double *readings, Report *repor
             memcpy(readings, inputs_of(x->slot) + x->inputs,
                    (size_t)x->readings * sizeof *readings);
             break;
+        }
+        if (why == CALL_INTERRUPTED) {
+            report->failure = (Incident){.call = why, .instance = i};
+            return 0;
         }
         lock(&r->recovering);
         int again = x->slot != slot || x->given_up; /* another thread has seen to it */

@@ -78,6 +78,8 @@ typedef struct {
     /* Called when an instance failed, or its worker ended, with the incident in the instance: brings
      * back what can be, gives up the rest, and returns whether to look again. NULL: it is final. */
     int (*recover)(int64_t instance);
+    /* Called every now and then while a worker is waited for; whether to give that up. NULL: no. */
+    int (*interrupted)(void);
     int64_t recovering; /* a lock */
 } Workers;
 

@@ -82,7 +82,8 @@ EXPORT void worker_run(WorkerLoop *w)
                 word_wake(&head->turn);
             continue;
         }
-        if (__atomic_load_n(&head->asked, __ATOMIC_SEQ_CST) != w->answered)
+        /* a request may be read before it is counted here */
+        if (__atomic_load_n(&head->asked, __ATOMIC_SEQ_CST) > w->answered)
             return;
         for (int64_t n = 0; n < w->spins; n++) {
             if (__atomic_load_n(&head->bell, __ATOMIC_ACQUIRE) != bell)
@@ -105,9 +106,10 @@ EXPORT int64_t worker_replay(const WorkerLoop *w, int64_t i, const double *rows,
     Slot *s = w->slots[i];
     Report report = {{0}, {0}, 0};
     int64_t k = 0;
-    while (k < n && fmus_step(w->fmus, i, rows[0], rows[1], rows + 2, w->scratch, &report)) {
-        k++;
-        rows += 2 + inputs;
+    for (; k < n; k++, rows += 2 + inputs) {
+        s->t = rows[0]; /* where it is, should it get no further */
+        if (!fmus_step(w->fmus, i, rows[0], rows[1], rows + 2, w->scratch, &report))
+            break;
     }
     if (k == n)
         fmus_read(w->fmus, i, inputs_of(s) + inputs, w->scratch, &report);

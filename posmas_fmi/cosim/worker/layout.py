@@ -7,14 +7,16 @@ import mmap
 import os
 import sys
 import tempfile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import attrs
 import numpy as np
 
 from posmas_fmi.cosim.fmus import Incident, MessageLog, Report
 from posmas_fmi.errors import BuildError
-from posmas_fmi.expression import Array
+
+if TYPE_CHECKING:
+    from posmas_fmi.expression import Array
 
 _int, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 _LINE = 64
@@ -100,6 +102,7 @@ class InstanceEntry(ctypes.Structure):
 
 
 Recover = ctypes.CFUNCTYPE(ctypes.c_int, _int)
+Interrupted = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
 class Workers(ctypes.Structure):
@@ -112,6 +115,7 @@ class Workers(ctypes.Structure):
         ("deadline", _double),
         ("spins", _int),
         ("recover", Recover),
+        ("interrupted", Interrupted),
         ("recovering", _int),
     )
 

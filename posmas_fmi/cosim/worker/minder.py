@@ -18,8 +18,8 @@ LOOK = 100  # ms between two looks
 KEPT = 1 << 20  # bytes of output that are kept
 MEMORY, OUTPUT, ALONE, CLOSED = 1, 2, 3, 4  # reasons to give up
 REASONS = {
-    MEMORY: "it used more memory than [plant] memory allows",
-    OUTPUT: "it wrote more output than [plant] output allows",
+    MEMORY: "it used more memory than it may",
+    OUTPUT: "it wrote more output than it may",
     CLOSED: "it closed a file descriptor that was not its own",
 }
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Literal
 
 import attrs
 
 from posmas_fmi.cosim.worker.minder import Limits
 from posmas_fmi.cosim.worker.process import Patience, WorkerProcess
-from posmas_fmi.cosim.worker.proxy import RemoteFile
+from posmas_fmi.cosim.worker.proxy import RemoteFile, built_here
 
 OnFailure = Literal["stop", "freeze", "restart"]
 
@@ -39,6 +40,10 @@ class Isolation:
     on_failure: OnFailure = "stop"
     limits: Limits = attrs.field(factory=Limits)
     patience: Patience = attrs.field(factory=Patience)
+
+    def separates(self, path: Path) -> bool:
+        """Whether an FMU file belongs into worker processes."""
+        return self.mode == "process" or (self.mode == "auto" and not built_here(path))
 
 
 def processors() -> int:
@@ -101,6 +106,8 @@ class WorkerPool:
 
     def close(self) -> None:
         """End all processes."""
+        for worker in self._all:
+            worker.say_goodbye()
         for worker in self._all:
             worker.close()
         self._all.clear()

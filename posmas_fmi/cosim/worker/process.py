@@ -27,7 +27,7 @@ from posmas_fmi.cosim.fmus import DEADLINE, DIED, NativeMessages
 from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import REASONS, Limits
 from posmas_fmi.cosim.worker.server import Settings
-from posmas_fmi.errors import FmuError, FmuLostError, PosmasError
+from posmas_fmi.errors import BuildError, FmuError, FmuLostError, PosmasError
 
 _LOG = logging.getLogger(__name__)
 
@@ -78,6 +78,19 @@ class Death:
     exit_code: int | None
     call: str
     output: str
+
+
+def require() -> None:
+    """Check that FMUs can run in worker processes here.
+
+    Raises
+    ------
+    BuildError
+        If not, and why.
+    """
+    if not layout.possible():
+        raise BuildError('worker processes need Linux or macOS; choose isolation = "none"')
+    native.library(native.worker_sources())
 
 
 class WorkerProcess:
@@ -174,7 +187,7 @@ class WorkerProcess:
         except OSError:
             self._lose(DIED)
         self._library.remote_ask(ctypes.addressof(self.entry))
-        step = content.get("method") in ("do_step", "read", "write")
+        step = content["do"] == "replay" or content.get("method") in ("do_step", "read", "write")
         self._await(self._patience.step if step else self._patience.start)
         answer = frames.receive(self._link)
         if answer is None:
@@ -232,6 +245,12 @@ class WorkerProcess:
         except OSError:
             return ""
         return data.decode("utf-8", "replace").replace("\0", "").strip()
+
+    def say_goodbye(self) -> None:
+        """Ask the process to end."""
+        if self.alive:
+            _say_goodbye(self._link)
+            self._library.remote_ask(ctypes.addressof(self.entry))
 
     def close(self) -> None:
         """End the process and remove what it has left; a second call does nothing."""

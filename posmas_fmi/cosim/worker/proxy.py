@@ -75,6 +75,12 @@ class RemoteFile(FmuFile):
 
     def instantiate(self, name: str) -> RemoteInstance:
         """Create an instance in a worker process."""
+        instance = self.prepare(name)
+        instance.make(instance.worker)
+        return instance
+
+    def prepare(self, name: str) -> RemoteInstance:
+        """Return an instance that is to be made in its worker process: see `make`."""
         if self.closed:
             raise FmuError("the file is closed", str(self.path))
         return RemoteInstance(self, name, self._place(self))
@@ -90,7 +96,7 @@ class _NotLoaded:
 
 
 class RemoteInstance(FmuInstance):
-    """An instance in a worker process; made by `RemoteFile.instantiate`.
+    """An instance in a worker process; made by `RemoteFile.instantiate` or `prepare`.
 
     Attributes
     ----------
@@ -107,21 +113,23 @@ class RemoteInstance(FmuInstance):
         self._prefix = f"fmi{file.version}"
         self._real = "Real" if file.version == 2 else "Float64"
         self.start: tuple[dict[str, Any], float, float | None, float | None] | None = None
-        self.make(worker)
+        self.worker, self._freed = worker, True
 
     def make(self, worker: WorkerProcess) -> None:
         """Be a fresh instance in that worker process."""
         self.worker = worker
-        self._freed = False
         path = str(self.file.path)
         with _Lost(self):
             worker.load(path, str(self.file.folder))
             self.key, _ = worker.request({"do": "instantiate", "path": path, "name": self.name})
+        self._freed = False
 
     def free(self) -> None:
         """Free the instance; a second call does nothing."""
-        if not self._freed and self.worker.alive:
-            self._freed = True
+        if self._freed:
+            return
+        self._freed = True
+        if self.worker.alive:
             try:
                 self._ask("free")
             except FmuError:

@@ -13,9 +13,9 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import native
+from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.fmus import DEADLINE, DIED, Incident, PortMap, call_name
 from posmas_fmi.cosim.worker import layout
-from posmas_fmi.cosim.worker.failure import Failure
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerLost, WorkerProcess
 from posmas_fmi.cosim.worker.proxy import RemoteInstance
@@ -43,14 +43,14 @@ class Remote:
     pool : WorkerPool
         Where they live.
     isolation : Isolation
+    failures : list of Failure
+        Where to note what goes wrong.
 
     Attributes
     ----------
     is_remote : (n,) array of int
-    failures : list of Failure
-        What went wrong so far.
     interrupted : bool
-        Whether Ctrl-C came while an instance was brought back.
+        Whether Ctrl-C came while a process was waited for.
     """
 
     def __init__(
@@ -60,6 +60,7 @@ class Remote:
         readings: Sequence[PortMap],
         pool: WorkerPool,
         isolation: Isolation,
+        failures: list[Failure],
     ) -> None:
         self._pool, self._isolation = pool, isolation
         self._inputs, self._readings = tuple(inputs), tuple(readings)
@@ -71,7 +72,7 @@ class Remote:
         }
         n = len(instances)
         self.is_remote = np.array([k in self._remote for k in range(n)], dtype=np.int64)
-        self.failures: list[Failure] = []
+        self.failures = failures
         self.interrupted = False
         shared = list(dict.fromkeys(one.worker for one in self._remote.values()))
         self._first_own = len(shared)  # then one place for each instance that gets its own process
@@ -82,6 +83,7 @@ class Remote:
         self._numbers: list[Any] = [None for _ in self._workers]
         self._entries = (layout.InstanceEntry * max(n, 1))()
         self._saved: dict[int, _Saved] = {}
+        self._final: dict[int, Failure] = {}  # the last one of each
         self._restarted: dict[int, float] = {}
         self._next_snapshot = time.monotonic() + SNAPSHOT_EVERY
         keeps = isolation.on_failure != "stop"
@@ -95,6 +97,7 @@ class Remote:
             if k in self._remote:
                 self._members[entry.worker].append(k)
         self._recover = layout.Recover(self._on_failure) if keeps else layout.Recover()
+        self._look = layout.Interrupted(self._on_look)
         self._context = layout.Workers(
             ctypes.addressof(self._pointers),
             len(self._workers),
@@ -102,6 +105,7 @@ class Remote:
             isolation.patience.step,
             pool.spins,
             self._recover,
+            self._look,
         )
         self._hook = layout.Hook()
         self._library.remote_define(ctypes.addressof(self._hook), ctypes.addressof(self._context))
@@ -114,9 +118,18 @@ class Remote:
         return ctypes.addressof(self._hook)
 
     def close(self) -> None:
-        """Release the memory of the C loop; the processes are those of the pool."""
+        """Release the memory of the C loop, and end processes that are in the middle of a step.
+
+        The others are those of the pool.
+        """
         for entry in self._entries:
             self._library.remote_forget(ctypes.addressof(entry))
+        for worker, memory in zip(self._workers, self._memory, strict=True):
+            if worker and memory and any(slot.done != slot.posted for slot in memory.slots):
+                worker.kill()
+        # functions that C may call hold this object, and it holds them
+        self._context.recover, self._context.interrupted = layout.Recover(), layout.Interrupted()
+        del self._recover, self._look
 
     # ---- places ---------------------------------------------------------------------------------
 
@@ -144,21 +157,17 @@ class Remote:
         self._memory[place] = memory
         self._numbers[place] = numbers = np.array(members, dtype=np.int64)
         worker.entry.numbers, worker.entry.instances = numbers.ctypes.data, len(members)
-        for m, address in zip(members, memory.addresses, strict=True):
+        for m, slot, address in zip(members, memory.slots, memory.addresses, strict=True):
+            slot.t = self._remote[m].time
             self._entries[m].worker, self._entries[m].slot = place, address
         self._pointers[place] = ctypes.addressof(worker.entry)
-
-    def _leave(self, number: int) -> None:
-        """Take an instance out of its worker; the worker goes on to hold it, unused."""
-        place = self._entries[number].worker
-        if number in self._members[place] and place >= self._first_own:
-            self._drop(place)
 
     def _drop(self, place: int) -> None:
         """End the worker at a place."""
         worker = self._workers[place]
         self._pointers[place] = None
         self._workers[place], self._members[place] = None, []
+        self._memory[place] = None
         if worker is not None:
             self._pool.drop(worker)
 
@@ -175,13 +184,11 @@ class Remote:
         number = incident.instance
         instance = self._remote[number]
         slot, inputs, _ = self._slot(number)
-        ports = self._inputs[number]
-        values = zip(ports.variables, inputs, ports.scale, ports.offset, strict=True)
         facts: dict[str, Any] = {
             "agent": instance.name,
             "fmu": instance.file.path.name,
             "time": slot.t,
-            "inputs": {name: float(v * scale + offset) for name, v, scale, offset in values},
+            "inputs": self._inputs[number].values_of(inputs),
             "messages": instance.messages[-5:],
         }
         if incident.call in (DIED, DEADLINE):
@@ -207,15 +214,16 @@ class Remote:
 
     def error(self, incident: Incident) -> FmuCallError:
         """Return an incident that ended the run as an error, and note it."""
-        failure = self.failure(incident)
-        self.failures.append(failure)
-        place, message = str(failure).split(": ", 3)[:3], str(failure).split(": ", 3)[3]
-        where = ": ".join(place)
+        number = incident.instance
+        if self._entries[number].given_up:
+            failure = self._final[number]
+        else:
+            failure = self.failure(incident)
+            self.failures.append(failure)
+        about = (failure.message, failure.where, failure.agent, failure.time)
         if incident.call in (DIED, DEADLINE):
-            return FmuLostError(
-                message, where, failure.agent, failure.time, failure.signal, failure.exit_code
-            )
-        return FmuCallError(message, where, failure.agent, failure.time)
+            return FmuLostError(*about, failure.signal, failure.exit_code)
+        return FmuCallError(*about)
 
     def _lost(self, lost: WorkerLost, number: int) -> FmuLostError:
         from posmas_fmi.cosim.worker.process import lost_error
@@ -224,6 +232,14 @@ class Remote:
         return lost_error(lost.death, one.file.path.name, one.name, lost.death.call, one.time)
 
     # ---- bringing back --------------------------------------------------------------------------
+
+    def _on_look(self) -> int:
+        """Answer the C loop, which waits: whether Ctrl-C has come."""
+        try:
+            time.sleep(0.0)  # signals are seen to here, or where Python likes
+        except KeyboardInterrupt:
+            self.interrupted = True
+        return self.interrupted
 
     def _on_failure(self, number: int) -> int:
         """Answer the C loop: whether to look at the instance again."""
@@ -259,9 +275,13 @@ class Remote:
         if not restart:
             self._give_up(culprit)
         action: Any = "restarted" if restart else "frozen"
-        failure = attrs.evolve(failure, action=action, detail="; ".join(notes))
+        self._note(culprit, attrs.evolve(failure, action=action, detail="; ".join(notes)))
+
+    def _note(self, number: int, failure: Failure) -> None:
+        self._final[number] = failure
         self.failures.append(failure)
-        _LOG.warning("%s; %s%s", failure, action, f": {failure.detail}" if notes else "")
+        detail = f": {failure.detail}" if failure.detail else ""
+        _LOG.warning("%s; %s%s", failure, failure.action, detail)
 
     def _give_up(self, number: int) -> None:
         self._entries[number].given_up = 1
@@ -269,8 +289,8 @@ class Remote:
 
     def _replace_worker(self, place: int, culprit: int) -> list[str]:
         """Start another process for the instances that shared one with the culprit."""
-        others = [m for m in self._members[place] if m != culprit]
-        others = [m for m in others if not self._entries[m].given_up]
+        members = [m for m in self._members[place] if self._entries[m].worker == place]
+        others = [m for m in members if m != culprit and not self._entries[m].given_up]
         self._drop(place)
         if not others:
             return []
@@ -294,6 +314,9 @@ class Remote:
             self._entries[number].incident.call = DIED
             self._entries[number].incident.instance = number
             self._give_up(number)
+            fmu, time = self._remote[number].file.path.name, self._remote[number].time
+            cause = f"it shared a process with an FMU that failed, and then {error.message}"
+            self._note(number, Failure(name, fmu, "", time, {}, cause, "frozen"))
             return f"{name} shared its process and could not be brought back: {error.message}"
 
     def _restart(self, number: int, at: float, step: float, notes: list[str]) -> bool:
@@ -302,6 +325,8 @@ class Remote:
         place = self._first_own + number
         if self._entries[number].worker == place:
             self._drop(place)
+        else:
+            notes += self._free(number)
         if not self._entries[number].past.cut:
             try:
                 self._put([number], place)
@@ -326,6 +351,14 @@ class Remote:
             return False
         notes.insert(0, f"from its start values at {at + step:g} s")
         return True
+
+    def _free(self, number: int) -> list[str]:
+        """Free an instance that has failed; should that end its process, bring the others back."""
+        instance, place = self._remote[number], self._entries[number].worker
+        if self._workers[place] is not instance.worker:
+            return []  # its process has ended
+        instance.free()
+        return [] if instance.worker.alive else self._replace_worker(place, number)
 
     def _put(self, members: list[int], place: int) -> None:
         """Make fresh instances in a new process: in their saved state, or initialised."""
@@ -353,13 +386,18 @@ class Remote:
         try:
             done, _ = instance.worker.request({"do": "replay", "number": at, "steps": past.n}, rows)
         except WorkerLost as lost:
+            instance.time = self._slot(number)[0].t
             raise self._lost(lost, number) from None
         slot, inputs, _ = self._slot(number)
+        instance.time = slot.t
         if past.n:
             last = np.frombuffer(rows, float)[-width:]
             slot.t, slot.h, inputs[:] = last[0], last[1], last[2:]
         if done < past.n or slot.report.failure.call:
-            raise instance.error("DoStep", f"failed at step {done + 1} of {past.n}")
+            raise instance.error(
+                "DoStep", f"failed again at step {min(done + 1, past.n)} of {past.n}"
+            )
+        instance.time = slot.t + slot.h
         saved = self._saved.get(number)
         source = f"from the state at {saved.time:g} s" if saved else "from its start"
         return f"{source} with {past.n} steps done again"
@@ -377,6 +415,18 @@ class Remote:
                 self._save(number, instance)
         now = time.monotonic()
         self._next_snapshot = now + max(SNAPSHOT_EVERY, SNAPSHOT_SHARE * (now - began))
+
+    def save(self, number: int) -> Any:
+        """Keep the state of an instance, for `restore`; not what it is brought back to."""
+        instance = self._remote[number]
+        slot, _, _ = self._slot(number)
+        return instance.serialise(), slot.t + slot.h, self._entries[number].past.n
+
+    def restore(self, number: int, saved: Any) -> None:
+        """Go back to a state that was kept: the steps since then are as if they had not been."""
+        data, time, steps = saved
+        self._remote[number].deserialise(data, time)
+        self._entries[number].past.n = steps
 
     def _save(self, number: int, instance: RemoteInstance) -> None:
         slot, _, _ = self._slot(number)

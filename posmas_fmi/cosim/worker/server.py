@@ -15,8 +15,8 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.cosim import native
 from posmas_fmi.cosim.fmus import Fmus, NativeMessages, PortMap
+from posmas_fmi.cosim.loading import load
 from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import Limits, Minder, bound
 from posmas_fmi.errors import FmuCallError, PosmasError
@@ -73,7 +73,7 @@ class Server:
     def __init__(self, settings: Settings, memory: layout.HeadMemory) -> None:
         self._link = socket.socket(fileno=settings.link)
         self._head = memory.head
-        self._library = native.load(Path(settings.library))
+        self._library = load(Path(settings.library))
         layout.check(self._library)
         self._library.worker_run.argtypes = [ctypes.c_void_p]
         self._library.worker_run.restype = None
@@ -101,6 +101,7 @@ class Server:
             self._loop.answered += 1
             self._said.clear()
             content, data = self._answer(request)
+            self._head.doing = b""
             frames.send(self._link, {**content, "said": self._said}, data)
         for file in self._files.values():
             file.close()

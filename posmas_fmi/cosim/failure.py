@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import attrs
@@ -20,7 +21,7 @@ class Failure:
     fmu : str
         File name.
     call : str
-        Of the FMI function, if known.
+        The FMI function, if known.
     time : float
         Where the step began [s].
     inputs : dict of str to float
@@ -53,16 +54,28 @@ class Failure:
     output: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what summary.json says about it."""
+        """Return what summary.json says about it; the cause is the verdict there."""
         facts = attrs.asdict(self)
-        return {k: v for k, v in facts.items() if v not in (None, "", ())}
+        facts["verdict"] = facts.pop("cause")
+        finite = {n: v if math.isfinite(v) else None for n, v in self.inputs.items()}
+        facts |= {"inputs": finite, "messages": list(self.messages)}
+        return {k: v for k, v in facts.items() if v not in (None, "", [], {})}
 
-    def __str__(self) -> str:
+    @property
+    def where(self) -> str:
+        """FMU, agent and call."""
+        return f"{self.fmu}: {self.agent}: {self.call or 'between calls'}"
+
+    @property
+    def message(self) -> str:
+        """What happened there, with time, inputs and what was said."""
         inputs = ", ".join(f"{name} = {value:.6g}" for name, value in self.inputs.items())
-        text = f"{self.fmu}: {self.agent}: {self.call or 'between calls'}: {self.cause}"
-        text += f" (at time {self.time:g} s{'; inputs ' + inputs if inputs else ''})"
+        text = f"{self.cause} (at time {self.time:g} s{'; inputs ' + inputs if inputs else ''})"
         if self.messages:
             text += f": {'; '.join(self.messages)}"
         if self.output:
             text += f"; its process had written: {self.output}"
         return text
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.message}"

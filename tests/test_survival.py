@@ -1,0 +1,326 @@
+"""FMUs that crash, hang, leave or lie: each is a verdict that names it, and nothing is left."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from faulty import faulty_fmu, faulty_plant, faulty_system, values
+
+from posmas_fmi.cli import main
+from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.fmu_plant import Isolation
+from posmas_fmi.cosim.master import Outcome
+from posmas_fmi.cosim.worker.minder import Limits
+from posmas_fmi.cosim.worker.process import Patience
+from posmas_fmi.errors import FmuLostError
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts in /proc")
+
+VERDICTS = {
+    "segfault": "ended by signal 11 (SIGSEGV)",
+    "abort": "ended by signal 6 (SIGABRT)",
+    "exit": "ended with exit code 0",
+    "hang": "did not answer within 0.3 s",
+    "error": "returned status 3 (Error)",
+    "fatal": "returned status 4 (Fatal)",
+    "discard": "returned status 2 (Discard)",
+    "outside": "returned status -7 (outside the standard)",
+    "not a number": "x is not finite (nan)",
+    "stack": "ended by signal 11 (SIGSEGV)",
+    "memory": "used more memory than it may",
+    "output": "wrote more output than it may",
+}
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+def isolation(on_failure: Any = "stop", patience: float = 20.0, **options: Any) -> Isolation:
+    return Isolation(
+        "process",
+        **{"workers": 1, **options},
+        on_failure=on_failure,
+        limits=Limits(memory=0.3, output=8),
+        patience=Patience(step=patience, start=20.0),
+    )
+
+
+def run(
+    fmu: Path, faults: dict[int, dict[str, float]], apart: Isolation, loop: Any = "c"
+) -> tuple[Outcome, np.ndarray]:
+    rows: list[np.ndarray] = []
+    system = faulty_system()
+    with faulty_plant(fmu, faults, apart) as plant:
+        outcome = engine.run(
+            system,
+            plant,
+            lambda t, values: rows.append(values["x"][..., 0].copy()),
+            choice=engine.choose(system.law, loop),
+        )
+    return outcome, np.concatenate(rows)
+
+
+# ---- what is left --------------------------------------------------------------------------------
+
+
+def traces() -> Counter[str]:
+    """What this process holds: children, descriptors, temporary folders, FMUs that are mapped."""
+    found: Counter[str] = Counter()
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(stat.read_text().rpartition(")")[2].split()[1])
+        except (OSError, IndexError):
+            continue
+        found["child"] += parent == os.getpid()
+    found["descriptor"] = len(os.listdir("/proc/self/fd"))
+    found["folder"] = len(list(Path(tempfile.gettempdir()).glob("posmas-fmi-*")))
+    maps = Path("/proc/self/maps").read_text()
+    found["library"] = len({line.split()[-1] for line in maps.splitlines() if "faulty" in line})
+    found["shared"] = maps.count("memfd:posmas-fmi-values")
+    found["segment"] = len(list(Path("/dev/shm").glob("*posmas*")))
+    return found
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(fmu: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = traces()
+    yield
+    assert traces() == before
+
+
+# ---- one fault, one verdict ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", VERDICTS)
+def test_a_fault_ends_the_run_with_a_verdict(fmu: Path, fault: str) -> None:
+    """It names FMU, agent, call, time and inputs; what was recorded up to it stays."""
+    patience = 0.3 if fault == "hang" else 20.0
+    outcome, x = run(fmu, {1: values(fault, at=0.5)}, isolation(patience=patience))
+    assert (outcome.ended, outcome.failed_agent) == ("failed", "2")
+    assert VERDICTS[fault] in outcome.reason
+    call = "fmi2GetReal" if fault == "not a number" else "fmi2DoStep"
+    assert outcome.reason.startswith(f"faulty.fmu: 2: {call}: ")
+    assert "at time 0.5 s; inputs u = 0.06" in outcome.reason
+    (incident,) = outcome.incidents
+    assert (incident.agent, incident.action, incident.time) == ("2", "stopped", 0.5)
+    assert len(x) == 11
+
+
+@pytest.mark.parametrize("fault", ["segfault", "hang", "error", "not a number"])
+@pytest.mark.parametrize("action", ["stop", "freeze"])
+def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, action: str) -> None:
+    here, there = (
+        run(fmu, {1: values(fault)}, isolation(action, 0.3), loop) for loop in ("c", "numpy")
+    )
+    np.testing.assert_allclose(here[1], there[1], rtol=1e-12)
+    assert here[0].ended == there[0].ended == ("failed" if action == "stop" else "complete")
+    assert here[0].reason == there[0].reason
+    strip = {"inputs": {}}
+    told = [[i.to_dict() | strip for i in outcome.incidents] for outcome, _ in (here, there)]
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("apart", ["process", "none"])
+@pytest.mark.parametrize("loop", ["c", "numpy"])
+def test_a_frozen_agent_stays_and_the_others_go_on(fmu: Path, apart: Any, loop: str) -> None:
+    import attrs
+
+    outcome, x = run(
+        fmu, {1: values("error", at=0.5)}, attrs.evolve(isolation("freeze"), mode=apart), loop
+    )
+    assert outcome.ended == "complete"
+    assert [(i.agent, i.action) for i in outcome.incidents] == [("2", "frozen")]
+    assert "u" in outcome.incidents[0].inputs
+    assert (x[10:, 1] == x[10, 1]).all()
+    assert (np.diff(x[:, 0]) > 0).all()
+    assert (np.diff(x[:, 2]) != 0).all()
+
+
+def test_a_restarted_agent_begins_again_where_the_same_fault_comes_back(fmu: Path) -> None:
+    """A new instance cannot get past the same steps: one from its start values takes its place."""
+    at_once, _ = run(fmu, {1: values("segfault", at=0.5)}, isolation("restart"))
+    told = [(i.agent, i.action) for i in at_once.incidents]
+    assert told == [("2", "restarted"), ("2", "frozen")]  # the clock of the fault runs on
+    assert "start values at 0.55 s" in at_once.incidents[0].detail
+    assert "so soon" in at_once.incidents[1].detail
+
+
+def test_a_fault_that_does_not_come_back_leaves_no_mark(
+    fmu: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The steps since the last snapshot are done again: the result is that of a healthy run."""
+    monkeypatch.setenv("POSMAS_TEST_MARK", str(tmp_path / "mark"))
+    outcome, x = run(fmu, {1: values("once", at=0.5)}, isolation("restart"))
+    assert [(i.agent, i.action) for i in outcome.incidents] == [("2", "restarted")]
+    assert "11 steps done again" in outcome.incidents[0].detail
+    assert "1, 3 shared its process" in outcome.incidents[0].detail
+    _, healthy = run(fmu, {}, isolation())
+    np.testing.assert_array_equal(x, healthy)
+
+
+def test_an_fmu_that_crashes_when_freed_harms_nobody(fmu: Path) -> None:
+    outcome, x = run(fmu, {1: values("free crashes", at=0.5)}, isolation("restart"))
+    assert {i.agent for i in outcome.incidents} == {"2"}
+    assert outcome.ended == "complete"
+    assert (np.diff(x[:, 2]) != 0).all()
+
+
+def test_log_floods_and_closed_descriptors(fmu: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    outcome, _ = run(fmu, {1: values("logs", at=0.5)}, isolation())
+    assert outcome.ended == "complete"
+    outcome, _ = run(fmu, {1: values("closes", at=0.2)}, isolation())
+    assert outcome.ended in ("complete", "failed")  # it is over before the worker sees it, or not
+
+
+def test_a_fault_at_the_start_is_an_error_of_the_start(fmu: Path) -> None:
+    for fault in ("segfault", "exit"):
+        with pytest.raises(FmuLostError, match=r"faulty\.fmu: 2: fmi2ExitInitializationMode"):
+            run(fmu, {1: values(fault, at=-1.0)}, isolation())
+
+
+def test_a_worker_that_is_killed_from_outside(fmu: Path) -> None:
+    system = faulty_system()
+    with faulty_plant(fmu, {}, isolation("restart", workers=2)) as plant:
+        pids = [one.worker.pid for one in plant._instances]
+
+        def record(times: np.ndarray, rows: dict[str, np.ndarray]) -> None:
+            if times[-1] >= 0.3 and pids:
+                os.kill(pids.pop(), signal.SIGKILL)
+                pids.clear()
+
+        choice = engine.choose(system.law, "numpy")
+        outcome = engine.run(system, plant, record, choice=choice)
+    assert outcome.ended == "complete"
+    assert [i.action for i in outcome.incidents] == ["restarted"]
+    assert outcome.incidents[0].signal == signal.SIGKILL
+
+
+def test_instances_that_want_a_process_each_get_one(tmp_path_factory: Any) -> None:
+    once = faulty_fmu(tmp_path_factory.mktemp("once"), once=True)
+    with faulty_plant(once, {}, isolation()) as plant:
+        assert len({one.worker.pid for one in plant._instances}) == 3
+        outcome = engine.run(faulty_system(), plant)
+    assert outcome.ended == "complete"
+
+
+def test_ctrl_c_ends_a_run_that_waits_for_an_fmu(fmu: Path) -> None:
+    patient = Isolation("process", 1, patience=Patience(step=60.0))
+    system = faulty_system()
+    for loop in ("c", "numpy"):
+        with faulty_plant(fmu, {1: values("hang", at=0.5)}, patient) as plant:
+            signal.signal(signal.SIGALRM, signal.default_int_handler)
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            choice = engine.choose(system.law, loop)
+            outcome = engine.run(system, plant, choice=choice)
+        assert (outcome.ended, outcome.steps) == ("cancelled", 10)
+
+
+# ---- through the command -------------------------------------------------------------------------
+
+SCENARIO = """
+[scenario]
+name = "faulty"
+until = 1.0
+period = 0.05
+engine = "{loop}"
+[agent]
+A = [[-1.0]]
+B = [[1.0]]
+C = [[1.0]]
+[network]
+agents = 3
+arcs = [[1, 2], [2, 3]]
+pinned = [1]
+[plant]
+fmu = "faulty.fmu"
+inputs = {{u1 = "u"}}
+outputs = {{y1 = "x"}}
+states = {{x1 = "x"}}
+deadline = 0.3
+workers = 1
+on_failure = "{action}"
+[[plant.override]]
+agent = 2
+parameters = {{fault = {fault}, at = {at}}}
+[leader]
+s0 = [0.0]
+"""
+
+
+def scenario(fmu: Path, folder: Path, fault: str, action: str = "stop", loop: str = "auto") -> Path:
+    given = values(fault)
+    folder.mkdir(exist_ok=True)
+    (folder / "faulty.fmu").write_bytes(fmu.read_bytes())
+    path = folder / "faulty.toml"
+    path.write_text(SCENARIO.format(action=action, loop=loop, **given), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fault", "action", "code", "verdict"),
+    [("abort", "stop", 3, "failed"), ("exit", "freeze", 1, "not converged")],
+)
+def test_the_command_tells_the_failure_in_all_its_files(
+    fmu: Path, tmp_path: Path, capsys: Any, fault: str, action: str, code: int, verdict: str
+) -> None:
+    path = scenario(fmu, tmp_path / "s", fault, action)
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == code
+    printed = capsys.readouterr().out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert summary["verdict"] == verdict
+    first = summary["incidents"][0]
+    assert (first["agent"], first["call"], first["time"]) == ("2", "fmi2DoStep", 0.5)
+    assert VERDICTS[fault] in first["verdict"]
+    assert "Failures of FMUs" in page
+    assert VERDICTS[fault] in page
+    if action == "stop":
+        assert VERDICTS[fault] in printed
+    else:
+        assert summary["agents"][1]["status"] == "frozen"
+        assert "frozen after a failure of the FMU: 2" in printed
+
+
+def test_the_death_of_the_master_leaves_nothing(fmu: Path, tmp_path: Path) -> None:
+    path = scenario(fmu, tmp_path / "s", "hang")
+    path.write_text(path.read_text().replace("deadline = 0.3", "deadline = 60.0"))
+    temporary = tmp_path / "tmp"
+    temporary.mkdir()
+    master = subprocess.Popen(
+        [sys.executable, "-m", "posmas_fmi", "run", str(path), "--out", str(tmp_path / "out")],
+        env={**os.environ, "TMPDIR": str(temporary)},
+    )
+    workers: list[int] = []
+    until = time.monotonic() + 30
+    while not workers and time.monotonic() < until:
+        time.sleep(0.05)
+        workers = descendants(master.pid)
+    time.sleep(0.5)
+    master.kill()
+    master.wait()
+    while any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert not list(temporary.glob("posmas-fmi-worker-*"))
+
+
+def descendants(pid: int) -> list[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(word) for word in text.read_text().split()] if text.exists() else []
