@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
 import logging
 import os
@@ -9,6 +11,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -80,6 +83,7 @@ def run(
 
 def traces() -> Counter[str]:
     """What this process holds: children, descriptors, temporary folders, FMUs that are mapped."""
+    gc.collect()
     found: Counter[str] = Counter()
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -87,7 +91,9 @@ def traces() -> Counter[str]:
         except (OSError, IndexError):
             continue
         found["child"] += parent == os.getpid()
-    found["descriptor"] = len(os.listdir("/proc/self/fd"))
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            found["descriptor"] += os.readlink(link).startswith(("socket:", "pipe:", "/memfd:"))
     found["folder"] = len(list(Path(tempfile.gettempdir()).glob("posmas-fmi-*")))
     maps = Path("/proc/self/maps").read_text()
     found["library"] = len({line.split()[-1] for line in maps.splitlines() if "faulty" in line})
@@ -148,8 +154,7 @@ def test_a_frozen_agent_stays_and_the_others_go_on(fmu: Path, apart: Any, loop: 
     assert [(i.agent, i.action) for i in outcome.incidents] == [("2", "frozen")]
     assert "u" in outcome.incidents[0].inputs
     assert (x[10:, 1] == x[10, 1]).all()
-    assert (np.diff(x[:, 0]) > 0).all()
-    assert (np.diff(x[:, 2]) != 0).all()
+    assert (np.diff(x[:, [0, 2]], axis=0) != 0).all()
 
 
 def test_a_restarted_agent_begins_again_where_the_same_fault_comes_back(fmu: Path) -> None:
@@ -225,9 +230,8 @@ def test_ctrl_c_ends_a_run_that_waits_for_an_fmu(fmu: Path) -> None:
     system = faulty_system()
     for loop in ("c", "numpy"):
         with faulty_plant(fmu, {1: values("hang", at=0.5)}, patient) as plant:
-            signal.signal(signal.SIGALRM, signal.default_int_handler)
-            signal.setitimer(signal.ITIMER_REAL, 0.5)
             choice = engine.choose(system.law, loop)
+            threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
             outcome = engine.run(system, plant, choice=choice)
         assert (outcome.ended, outcome.steps) == ("cancelled", 10)
 
@@ -273,6 +277,7 @@ def scenario(fmu: Path, folder: Path, fault: str, action: str = "stop", loop: st
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "action", "code", "verdict"),
     [("abort", "stop", 3, "failed"), ("exit", "freeze", 1, "not converged")],
@@ -298,6 +303,7 @@ def test_the_command_tells_the_failure_in_all_its_files(
         assert "frozen after a failure of the FMU: 2" in printed
 
 
+@pytest.mark.slow
 def test_the_death_of_the_master_leaves_nothing(fmu: Path, tmp_path: Path) -> None:
     path = scenario(fmu, tmp_path / "s", "hang")
     path.write_text(path.read_text().replace("deadline = 0.3", "deadline = 60.0"))

@@ -17,6 +17,7 @@ from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.fmus import Incident, Report
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
 from posmas_fmi.cosim.master import (
     DIVERGED,
@@ -522,11 +523,13 @@ class Engine:
         ended: Any = ""
         reason = agent = ""
         try:
-            if self._start is None:
-                self._begin()
-            else:
-                self._go_on_from(self._start)
-            self._slices(record, progress)
+            with Interrupt() as interrupt:
+                self._plant.obey(interrupt)
+                if self._start is None:
+                    self._begin()
+                else:
+                    self._go_on_from(self._start)
+                self._slices(record, progress)
         except KeyboardInterrupt:
             ended, reason = "cancelled", "interrupted"
             self._take(record)
@@ -679,7 +682,7 @@ class Engine:
             log.warning("the system gives no %d threads; going on with one", self._e.threads)
             self._use_threads(1)
             self._run(ctypes.addressof(self._e))
-        self._plant.fmus.raise_interrupt()
+        self._plant.fmus.check_interrupt()
         time_now = self._system.clock.time(self._e.k)
         self._plant.fmus.warn(self._reports[0], time_now)
         if self._incidents is not None and self._e.ended == _GOES_ON:

@@ -16,6 +16,7 @@ import numpy as np
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.fmus import FmuLoop, Fmus, Incident, NativeMessages, PortMap, Whole
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerProcess, require
 from posmas_fmi.cosim.worker.proxy import RemoteFile, RemoteInstance
@@ -249,6 +250,10 @@ class FmuPlant:
                 at = slice(self.reading_at[number], self.reading_at[number + 1])
                 readings[at] = before[at]
                 incident.call = 0
+
+    def obey(self, interrupt: Interrupt) -> None:
+        """Wait for worker processes only until Ctrl-C comes, in the run that begins."""
+        self.fmus.obey(interrupt)
 
     def checkpoint(self) -> None:
         """Save states to restart from, if it is time."""

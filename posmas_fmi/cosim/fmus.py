@@ -12,6 +12,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim.failure import Action, Failure
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.served import Served, needs_python
 from posmas_fmi.errors import FmuCallError, FmuError
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
@@ -224,12 +225,12 @@ class Elsewhere(Interface):
         Of the structure `Remote` in csrc/fmus.h.
     is_remote : (n,) array of int
         Of each instance.
-    interrupted : bool
-        Whether Ctrl-C came while one was waited for.
+    interrupt : Interrupt
+        Of the run that goes on.
     """
 
     is_remote: Whole
-    interrupted: bool
+    interrupt: Interrupt
 
     @property
     def address(self) -> int:
@@ -273,6 +274,7 @@ class Fmus:
         self._inputs, self._readings = tuple(inputs), tuple(readings)
         self.inputs: Array | None = None
         self._remote: Elsewhere | None = None
+        self._interrupt = Interrupt()
         self.failures: list[Failure] = []
         self._keep: list[Any] = []  # what the structures point to
         self._served = Served()
@@ -321,10 +323,15 @@ class Fmus:
         """Whether an instance is in another process."""
         return self._remote is not None and bool(self._remote.is_remote[number])
 
-    def raise_interrupt(self) -> None:
-        """Pass on the Ctrl-C that came while another process was waited for."""
-        if self._remote is not None and self._remote.interrupted:
-            raise KeyboardInterrupt
+    def obey(self, interrupt: Interrupt) -> None:
+        """Wait for other processes only while no Ctrl-C has come."""
+        self._interrupt = interrupt
+        if self._remote is not None:
+            self._remote.interrupt = interrupt
+
+    def check_interrupt(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C has come."""
+        self._interrupt.check()
 
     def _bind(self, file: FmuFile, inputs: PortMap, readings: PortMap) -> _Binding:
         if needs_python(file, file.ports(inputs.variables), file.ports(readings.variables)):
@@ -538,7 +545,7 @@ class FmuLoop:
         self._check(report, t)
 
     def _check(self, report: Report, time: float) -> None:
-        self._fmus.raise_interrupt()
+        self._fmus.check_interrupt()
         self._fmus.warn(report, time)
         if report.failure.call:
             raise self._fmus.error(report.failure, time)

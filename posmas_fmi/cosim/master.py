@@ -15,6 +15,7 @@ from posmas_fmi.cosim.channel import Channel, Mailbox
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
 from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
 from posmas_fmi.cosim.failure import Failure
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import Heard, Law, Weights
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.wiring import Whole, Wiring
@@ -328,8 +329,12 @@ class Run:
         ended: Any = "complete"
         reason = agent = ""
         try:
-            with np.errstate(invalid="ignore", over="ignore"):  # running away is a verdict
-                self._loop()
+            with (
+                np.errstate(invalid="ignore", over="ignore"),  # running away is a verdict
+                Interrupt() as interrupt,
+            ):
+                self.plant.obey(interrupt)
+                self._loop(interrupt)
         except _Stop as stop:
             ended, reason, agent = stop.ended, stop.reason, stop.agent
         except FmuCallError as error:
@@ -353,7 +358,7 @@ class Run:
             incidents=tuple(self.plant.failures),
         )
 
-    def _loop(self) -> None:
+    def _loop(self, interrupt: Interrupt) -> None:
         clock, system, state = self.system.clock, self.system, self.state
         everyone = np.arange(system.instances)
         self.plant.read(everyone, 0.0, state.readings)
@@ -373,6 +378,7 @@ class Run:
             state.k = k + 1
             begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
             self.plant.checkpoint()
+            interrupt.check()
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.failure import Failure
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.expression import Array
 
 Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -57,6 +58,9 @@ class Plant(Interface):
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
 
+    def obey(self, interrupt: Interrupt) -> None:
+        """Wait for nothing longer than until Ctrl-C comes, in the run that begins."""
+
     def checkpoint(self) -> None:
         """Save states for later, if it is time; called between steps."""
 
@@ -87,6 +91,9 @@ class _Agents:
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
         self.x = saved.copy()
+
+    def obey(self, interrupt: Interrupt) -> None:
+        """Nothing takes long."""
 
     def checkpoint(self) -> None:
         """Nothing to save."""

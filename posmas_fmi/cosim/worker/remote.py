@@ -15,6 +15,7 @@ import numpy as np
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.fmus import DEADLINE, DIED, Incident, PortMap, call_name
+from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker import layout
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerLost, WorkerProcess
@@ -49,8 +50,8 @@ class Remote:
     Attributes
     ----------
     is_remote : (n,) array of int
-    interrupted : bool
-        Whether Ctrl-C came while a process was waited for.
+    interrupt : Interrupt
+        Of the run that goes on: then processes are not waited for any more.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class Remote:
         n = len(instances)
         self.is_remote = np.array([k in self._remote for k in range(n)], dtype=np.int64)
         self.failures = failures
-        self.interrupted = False
+        self.interrupt = Interrupt()
         shared = list(dict.fromkeys(one.worker for one in self._remote.values()))
         self._first_own = len(shared)  # then one place for each instance that gets its own process
         self._workers: list[WorkerProcess | None] = [*shared, *(None for _ in range(n))]
@@ -235,18 +236,13 @@ class Remote:
 
     def _on_look(self) -> int:
         """Answer the C loop, which waits: whether Ctrl-C has come."""
-        try:
-            time.sleep(0.0)  # signals are seen to here, or where Python likes
-        except KeyboardInterrupt:
-            self.interrupted = True
-        return self.interrupted
+        return self.interrupt.wanted
 
     def _on_failure(self, number: int) -> int:
         """Answer the C loop: whether to look at the instance again."""
         try:
             self._bring_back(number)
-        except KeyboardInterrupt:
-            self.interrupted = True
+        except KeyboardInterrupt:  # the second one
             return 0
         except Exception:
             _LOG.exception("after a failure the FMUs could not be brought back")
