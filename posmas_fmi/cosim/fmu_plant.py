@@ -27,6 +27,7 @@ from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
+from posmas_fmi.fmu.open import open_fmu
 from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
 from posmas_fmi.fmu.units import Conversion
 
@@ -297,8 +298,10 @@ class FmuPlant:
         FmuCallError
             If an FMU refuses.
         """
-        for instance, data in zip(self._instances, states, strict=True):
+        for number, (instance, data) in enumerate(zip(self._instances, states, strict=True)):
             instance.deserialise(data, time)
+            if self._remote is not None and self._remote.is_remote[number]:
+                self._remote.begin_at(number, data, time)
 
     def restore(self, saved: Any) -> None:
         """Go back to states that were kept."""
@@ -338,14 +341,14 @@ def _open(
 ) -> FmuFile:
     """Open an FMU, to run here or in worker processes."""
     if isolation.mode == "none" or not isolation.separates(path):
-        return FmuFile(path, messages)
+        return open_fmu(path, messages)
     try:
         require()
     except BuildError as error:
         if isolation.mode == "process":
             raise
         log.warning("%s runs in this process: %s", path.name, error)
-        return FmuFile(path, messages)
+        return open_fmu(path, messages)
     return RemoteFile(path, pool.place)
 
 

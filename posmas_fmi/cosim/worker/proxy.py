@@ -14,6 +14,7 @@ from posmas_fmi import resources
 from posmas_fmi.cosim.worker.process import WorkerLost, WorkerProcess, lost_error
 from posmas_fmi.errors import FmuError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.build import cache_folder
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
@@ -55,6 +56,7 @@ class RemoteFile(FmuFile):
 
     def __init__(self, path: str | Path, place: Place) -> None:
         self._place = place
+        self.kind = read_about(Path(path)).kind
         super().__init__(path)
 
     def _bind(self, where: str) -> None:
@@ -65,13 +67,15 @@ class RemoteFile(FmuFile):
     @property
     def only_once(self) -> bool:
         """Whether a process may hold one instance only."""
-        return bool(self.description.coSimulation.canBeInstantiatedOnlyOncePerProcess)
+        return bool(self.about.interface.canBeInstantiatedOnlyOncePerProcess)
 
     @property
     def saves(self) -> bool:
         """Whether it says that its state can be taken out as bytes."""
-        interface = self.description.coSimulation
-        return bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate)
+        interface = self.about.interface
+        return self.kind == "Co-Simulation" and bool(
+            interface.canGetAndSetFMUstate and interface.canSerializeFMUstate
+        )
 
     def instantiate(self, name: str) -> RemoteInstance:
         """Create an instance in a worker process."""

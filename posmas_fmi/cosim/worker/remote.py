@@ -418,6 +418,13 @@ class Remote:
         slot, _, _ = self._slot(number)
         return instance.serialise(), slot.t + slot.h, self._entries[number].past.n
 
+    def begin_at(self, number: int, data: bytes, time: float) -> None:
+        """Note that an instance stands in that state now, from which it can be brought back."""
+        slot, _, _ = self._slot(number)
+        slot.t, slot.h = time, 0.0
+        self._saved[number] = _Saved(data, time)
+        self._entries[number].past.n = self._entries[number].past.cut = 0
+
     def restore(self, number: int, saved: Any) -> None:
         """Go back to a state that was kept: the steps since then are as if they had not been."""
         data, time, steps = saved
