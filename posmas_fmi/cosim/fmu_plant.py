@@ -337,19 +337,23 @@ def _compiled_loop() -> ctypes.CDLL | None:
 
 
 def _open(
-    path: Path, messages: NativeMessages | None, isolation: Isolation, pool: WorkerPool
+    path: Path,
+    messages: NativeMessages | None,
+    isolation: Isolation,
+    pool: WorkerPool,
+    structure: Mapping[str, int],
 ) -> FmuFile:
     """Open an FMU, to run here or in worker processes."""
     if isolation.mode == "none" or not isolation.separates(path):
-        return open_fmu(path, messages)
+        return open_fmu(path, messages, structure=structure)
     try:
         require()
     except BuildError as error:
         if isolation.mode == "process":
             raise
         log.warning("%s runs in this process: %s", path.name, error)
-        return open_fmu(path, messages)
-    return RemoteFile(path, pool.place)
+        return open_fmu(path, messages, structure=structure)
+    return RemoteFile(path, pool.place, structure)
 
 
 def _start_all(

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -161,10 +161,11 @@ class WorkerProcess:
         """Of the process."""
         return self._process.pid
 
-    def load(self, path: str, unpacked: str) -> None:
+    def load(self, path: str, unpacked: str, structure: Mapping[str, int]) -> None:
         """Load an FMU, once."""
         if path not in self._loaded:
-            self.request({"do": "load", "path": path, "unpacked": unpacked})
+            about = {"path": path, "unpacked": unpacked, "structure": dict(structure)}
+            self.request({"do": "load", **about})
             self._loaded.add(path)
 
     def request(

@@ -52,12 +52,16 @@ class RemoteFile(FmuFile):
     path : path-like
     place : callable
         Gives the worker process that the next instance of a file goes to.
+    structure : mapping of str to int, optional
+        Structural parameters.
     """
 
-    def __init__(self, path: str | Path, place: Place) -> None:
+    def __init__(
+        self, path: str | Path, place: Place, structure: Mapping[str, int] | None = None
+    ) -> None:
         self._place = place
         self.kind = read_about(Path(path)).kind
-        super().__init__(path)
+        super().__init__(path, structure=structure)
 
     def _bind(self, where: str) -> None:
         self._fmu: Any = _NotLoaded()
@@ -124,7 +128,7 @@ class RemoteInstance(FmuInstance):
         self.worker = worker
         path = str(self.file.path)
         with _Lost(self):
-            worker.load(path, str(self.file.folder))
+            worker.load(path, str(self.file.folder), self.file.about.structure)
             self.key, _ = worker.request({"do": "instantiate", "path": path, "name": self.name})
         self._freed = False
 

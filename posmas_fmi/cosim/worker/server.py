@@ -126,7 +126,10 @@ class Server:
     def _do_load(self, request: frames.Frame) -> Answer:
         path, unpacked = request.content["path"], request.content["unpacked"]
         if path not in self._files:
-            self._files[path] = open_fmu(path, self._messages, self._trace, Path(unpacked))
+            structure = request.content["structure"]
+            self._files[path] = open_fmu(
+                path, self._messages, self._trace, Path(unpacked), structure
+            )
         return None, b""
 
     def _do_instantiate(self, request: frames.Frame) -> Answer:
