@@ -294,7 +294,7 @@ def test_the_command_tells_the_failure_in_all_its_files(
     first = summary["incidents"][0]
     assert (first["agent"], first["call"], first["time"]) == ("2", "fmi2DoStep", 0.5)
     assert VERDICTS[fault] in first["verdict"]
-    assert "Failures of FMUs" in page
+    assert "Faults and incidents" in page
     assert VERDICTS[fault] in page
     if action == "stop":
         assert VERDICTS[fault] in printed
