@@ -95,6 +95,28 @@ class Region:
 
 
 @attrs.frozen
+class Delayed:
+    """Certified rates where messages are late.
+
+    Attributes
+    ----------
+    delay : float
+        Largest age of what is used of neighbours [s].
+    steps : int or None
+        The same in control periods.
+    rate : float
+        Proved rate of the tracking error [1/s], for a leader at rest.
+    observer_rate : float
+        Proved rate of the estimation error [1/s]; the local observer needs no messages.
+    """
+
+    delay: float
+    steps: int | None
+    rate: float
+    observer_rate: float
+
+
+@attrs.frozen
 class Certificate:
     """What is proved about a closed loop, and on which assumptions.
 
@@ -119,6 +141,8 @@ class Certificate:
         Rates of certificate C, the limit of a fast sampling [1/s].
     covers : tuple of str
         What else the same proof covers: sector, start, delays, lost messages.
+    delays : tuple of Delayed
+        Rates that are proved where messages are late or lost (certificate D).
     region_of_attraction : Region or None
         Under saturation.
     band : tuple of float or None
@@ -136,6 +160,7 @@ class Certificate:
     rate_continuous: float | None = None
     observer_rate_continuous: float | None = None
     covers: tuple[str, ...] = ()
+    delays: tuple[Delayed, ...] = ()
     region_of_attraction: Region | None = None
     band: tuple[tuple[float, ...], ...] | None = None
 
@@ -172,6 +197,7 @@ class Certificate:
             "observer_rate_continuous": json_number(self.observer_rate_continuous),
             "conditions": [c.to_dict() for c in self.conditions],
             "covers": list(self.covers),
+            "delays": [attrs.asdict(d) for d in self.delays],
             "region_of_attraction": None
             if region is None
             else {

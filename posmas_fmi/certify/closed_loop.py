@@ -11,9 +11,9 @@ import numpy as np
 from posmas_fmi.certify import general
 from posmas_fmi.certify.assumptions import assumptions
 from posmas_fmi.certify.band import guaranteed_band
-from posmas_fmi.certify.certificate import Certificate, Condition
+from posmas_fmi.certify.certificate import Certificate, Condition, Delayed
 from posmas_fmi.certify.contraction import Rate, continuous_rate
-from posmas_fmi.certify.delay import statement
+from posmas_fmi.certify.delay import delayed_rates, statement
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.certify.positivity import between_samples, gain_sign, metzler, non_positive_gain
@@ -69,6 +69,9 @@ def certify_loop(
         controller.contracts,
     )
     holds = all(c.holds for c in conditions)
+    delays: tuple[Delayed, ...] = ()
+    if holds and loop.network.adjacency.nnz:
+        delays = delayed_rates(loop, controller.proved_rate, observer.proved_rate)
     band = guaranteed_band(loop, disturbance) if holds and disturbance is not None else None
     region = None
     if holds and saturation is not None:
@@ -86,7 +89,8 @@ def certify_loop(
         rate_perron=best.rate,
         rate_continuous=best.continuous,
         observer_rate_continuous=observer.continuous,
-        covers=statement(loop, holds),
+        covers=statement(loop, holds, delays),
+        delays=delays,
         region_of_attraction=region,
         band=None if band is None else tuple(tuple(float(z) for z in row) for row in band),
     )
@@ -137,6 +141,12 @@ class Prover:
         local = self.feedback.name == "observer" and self.loop.observer == "local"
         nu = np.ones_like(self.weights.nu) if local else self.weights.nu
         return Contraction(nu, self.v, self.rate)
+
+    @property
+    def proved_rate(self) -> tuple[Feedback, Weights, float]:
+        """What certificate D takes from a feedback that contracts."""
+        assert self.rate is not None
+        return self.feedback, self.weights, self.rate
 
     @property
     def proved(self) -> bool:

@@ -43,10 +43,6 @@ class Digraphs:
         """Pinning, (draws, N, 1)."""
         return self.pinning[:, :, None]
 
-    def near(self, z: Array) -> Array:
-        """Add up over heard agents: ``Σ_j a_ij z_j``."""
-        return self.adjacency @ z
-
 
 def draw_digraphs(
     agents: int, p_max: float, degree: float, draws: int, rng: np.random.Generator

@@ -2,8 +2,8 @@
 
 Every draw is a loop that the certificate covers: ``g(t, x) = Θ(t) x`` with Θ switching inside the
 declared bounds, a sector gain of every input switching inside the sector, initial states, delays
-and losses of messages, and with `falsify_networks` the digraph and its pins. A hit is a
-counterexample; no hits prove nothing.
+and losses of the messages of every arc, and with `falsify_networks` the digraph and its pins. A hit
+is a counterexample; no hits prove nothing.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.certify.closed_loop import Prover
+from posmas_fmi.certify.delay import Rows, delayed_rate
 from posmas_fmi.certify.drawn import Digraphs, draw_digraphs
 from posmas_fmi.certify.loop import Loop
 from posmas_fmi.certify.weights import Weights
@@ -23,6 +24,7 @@ _LIBRARY = 48  # distinct Θ per call
 _INSTANTS = 4  # of every period at which signs are looked at
 _TOLERANCE = 1e-9
 _BATCH = 2000
+_ARCS = 10**6  # messages of a step at once
 _SAME_SIZE = 500  # draws in a row with the same number of agents
 
 
@@ -41,6 +43,13 @@ class Falsification:
         What the certificate claims for it; None where it claims nothing.
     worst_observer_factor, claimed_observer_factor : float or None
         The same for the estimation error.
+    worst_late, worst_observer_late : float
+        Largest ``‖δ_k‖/(‖δ_0‖ r^k)`` in the draws with delays and losses, e = 0 and a leader at
+        rest, for the r that certificate D claims with messages of that age; the same for e.
+    claimed_late_factor : float or None
+        That r.
+    oldest : int
+        Largest age of a message there, in periods.
     growth : float
         Largest ``|δ|`` at the end over ``|δ|`` at the start.
     violations : tuple of str
@@ -54,6 +63,10 @@ class Falsification:
     claimed_factor: float | None
     worst_observer_factor: float
     claimed_observer_factor: float | None
+    worst_late: float
+    worst_observer_late: float
+    claimed_late_factor: float | None
+    oldest: int
     growth: float
     violations: tuple[str, ...]
 
@@ -74,9 +87,11 @@ def falsify(
         With a control period.
     draws, periods, seed : int
     max_delay : int
-        Messages are up to so many periods old in every second draw.
+        Messages arrive up to so many periods late in every second draw, arc by arc; in half of
+        these all are twice as old all the time.
     loss : float
-        Probability that a message is lost there; the last one received is used.
+        Probability that a message is lost there; the last one received is used, until it is twice
+        `max_delay` periods old.
 
     Raises
     ------
@@ -85,14 +100,15 @@ def falsify(
     """
     if loop.period is None:
         raise ValueError("expected a loop with a control period")
-    claims = _own_claims(loop)
+    claims = _own_claims(loop, 2 * max_delay)
     graph = _Same(loop.network)
     rng = np.random.default_rng(seed)
+    batch = max(1, min(_BATCH, _ARCS // graph.N**2))
     found = [
-        _Batch(loop, graph, claims, rng, min(_BATCH, draws - k), max_delay, loss).run(periods)
-        for k in range(0, draws, _BATCH)
+        _Batch(loop, graph, claims, rng, min(batch, draws - k), max_delay, loss).run(periods)
+        for k in range(0, draws, batch)
     ]
-    return _judged(found, claims, draws, periods)
+    return _judged(found, claims, draws, periods, 2 * max_delay)
 
 
 def falsify_networks(
@@ -138,7 +154,9 @@ def falsify_networks(
     loop.network.require_reached()
     rng = np.random.default_rng(seed)
     degree = float((loop.network.in_degree + loop.network.pinning).max())
-    parts = _proved(loop, loop.weights)
+    held = 1 / loop.network.p_max
+    rows = Rows(np.array([held * (1 - 1e-9)]), np.array([(degree - held) * (1 + 1e-9)]))
+    parts = _proved(loop, loop.weights, rows, 2 * max_delay)
     claims, found = _Claims.nothing(1, loop.agent.m), []
     for k in range(0, draws, _SAME_SIZE):
         count = min(_SAME_SIZE, draws - k)
@@ -146,15 +164,15 @@ def falsify_networks(
         graphs = draw_digraphs(size, loop.network.p_max, degree, count, rng)
         claims = _Claims.of(parts, graphs.p, loop)
         found.append(_Batch(loop, graphs, claims, rng, count, max_delay, loss).run(periods))
-    return _judged(found, claims, draws, periods)
+    return _judged(found, claims, draws, periods, 2 * max_delay)
 
 
 def _judged(
-    found: list[tuple[float, float, float, float]], claims: _Claims, draws: int, periods: int
+    found: list[_Found], claims: _Claims, draws: int, periods: int, oldest: int
 ) -> Falsification:
-    least = min(f[0] for f in found)
-    tracking, observer = max(f[1] for f in found), max(f[2] for f in found)
-    growth = max(f[3] for f in found)
+    least = min(f.least for f in found)
+    tracking, observer = max(f.tracking for f in found), max(f.observer for f in found)
+    late, observer_late = max(f.late for f in found), max(f.observer_late for f in found)
     violations = []
     if least < -_TOLERANCE:
         violations.append(f"a state, estimate or estimation error falls to {least:.4g} (relative)")
@@ -168,24 +186,40 @@ def _judged(
                 f"the weighted {name} error grows by {factor:.6g} in a period"
                 + ("" if claim is None else f" (claimed {claim:.6g})")
             )
+    for name, ratio, claim in (
+        ("tracking", late, claims.late_factor),
+        ("estimation", observer_late, claims.observer_late_factor),
+    ):
+        if claim is not None and ratio > 1 + _TOLERANCE:
+            violations.append(
+                f"with messages up to {oldest} periods old the weighted {name} error is "
+                f"{ratio:.6g} times what the factor {claim:.6g} per period allows"
+            )
     return Falsification(
         draws, periods, least, tracking, claims.factor, observer, claims.observer_factor,
-        growth, tuple(violations),
+        late, observer_late, claims.late_factor, oldest,
+        max(f.growth for f in found), tuple(violations),
     )  # fmt: skip
+
+
+@attrs.frozen
+class _Found:
+    """What a batch found."""
+
+    least: float
+    tracking: float
+    observer: float
+    late: float
+    observer_late: float
+    growth: float
 
 
 class _Same:
     """One network for all draws."""
 
     def __init__(self, network: Network) -> None:
-        self.N, self.adjacency = network.N, network.adjacency
+        self.N, self.adjacency = network.N, network.adjacency.toarray()[None]
         self.degree, self.d = network.in_degree[:, None], network.pinning[:, None]
-
-    def near(self, z: Array) -> Array:
-        """Add up over heard agents: ``Σ_j a_ij z_j``."""
-        draws, n, m = z.shape
-        columns = z.transpose(1, 0, 2).reshape(n, draws * m)
-        return np.asarray((self.adjacency @ columns).reshape(n, draws, m).transpose(1, 0, 2))
 
 
 @attrs.frozen(eq=False)
@@ -194,12 +228,17 @@ class _Claims:
 
     v: Array
     v_observer: Array
+    v_late: Array
+    v_observer_late: Array
     factor: float | None = None
     observer_factor: float | None = None
+    late_factor: float | None = None
+    observer_late_factor: float | None = None
 
     @classmethod
     def nothing(cls, agents: int, m: int) -> _Claims:
-        return cls(np.ones((agents, m)), np.ones((agents, m)))
+        one = np.ones((agents, m))
+        return cls(one, one, one, one)
 
     @classmethod
     def of(cls, parts: _Parts, nu: Array, loop: Loop) -> _Claims:
@@ -208,35 +247,57 @@ class _Claims:
         controller, observer = parts["controller"], parts["observer"]
         spread = np.ones_like(nu) if loop.observer == "local" else nu
         return cls(
-            flat if controller is None else nu[..., None] * controller[0],
-            flat if observer is None else spread[..., None] * observer[0],
-            None if controller is None else controller[1],
-            None if observer is None else observer[1],
+            flat if controller is None else nu[..., None] * controller.v,
+            flat if observer is None else spread[..., None] * observer.v,
+            flat if controller is None else nu[..., None] * controller.v_late,
+            flat if observer is None else spread[..., None] * observer.v_late,
+            None if controller is None else controller.factor,
+            None if observer is None else observer.factor,
+            None if controller is None else controller.late,
+            None if observer is None else observer.late,
         )
 
 
-_Parts = dict[str, tuple[Array, float] | None]
+@attrs.frozen(eq=False)
+class _Part:
+    """What is claimed of one feedback: v and factor per period, without and with late messages."""
+
+    v: Array
+    factor: float
+    v_late: Array
+    late: float | None
 
 
-def _proved(loop: Loop, weights: Weights) -> _Parts:
-    """Weights v and factor r per period of each feedback; None where none is proved."""
+_Parts = dict[str, _Part | None]
+
+
+def _proved(loop: Loop, weights: Weights, rows: Rows, oldest: int) -> _Parts:
+    """Claims of both feedbacks; None where none is proved."""
     assert loop.period is not None
     parts: _Parts = {"controller": None, "observer": None}
     if loop.protocol == "printed":
         return parts
     for feedback in (loop.controller(weights), loop.estimator(weights)):
         prover = Prover(loop, feedback, weights)
-        if prover.v is not None and prover.rate is not None:
-            parts[feedback.name] = prover.v, float(np.exp(-prover.rate * loop.period))
+        if prover.v is None or prover.rate is None:
+            continue
+        late, v_late = None, prover.v
+        if prover.positive and oldest:
+            slower = delayed_rate(loop, feedback, rows, prover.rate, oldest * loop.period)
+            late = float(np.exp(-slower.rate * loop.period))
+            v_late = prover.v if slower.v is None else slower.v
+        factor = float(np.exp(-prover.rate * loop.period))
+        parts[feedback.name] = _Part(prover.v, factor, v_late, late)
     return parts
 
 
-def _own_claims(loop: Loop) -> _Claims:
+def _own_claims(loop: Loop, oldest: int) -> _Claims:
     """Claims of the certificate for the network of the loop."""
     if loop.protocol == "printed" or loop.network.unreached():
         return _Claims.nothing(loop.network.N, loop.agent.m)
     weights = loop.weights_perron
-    return _Claims.of(_proved(loop, weights), weights.nu, loop)
+    rows = Rows.of(loop.network, weights)
+    return _Claims.of(_proved(loop, weights, rows, oldest), weights.nu, loop)
 
 
 class _Batch:
@@ -256,59 +317,97 @@ class _Batch:
         self.graph = graph
         n, m = graph.N, loop.agent.m
         self.Phi, self.Gamma = _library(loop, rng)
-        kind = np.arange(draws) % 4  # 0, 1: exact estimates; 2, 3: estimates below; odd: delays
+        # 0, 1: exact estimates; 2, 3: estimates below; odd: late messages, all very late in 5 and 7
+        kind = np.arange(draws) % 8
+        self.oldest = 2 * max_delay
         self.delayed = (kind % 2 == 1) & (max_delay > 0)
-        self.exact = kind < 2
+        self.always = self.delayed & (kind >= 4)
+        self.exact = kind % 4 < 2
         self.max_delay, self.loss = max_delay, loss
         corner = rng.random((draws, n, m)) < 0.5
         self.x = np.where(corner, rng.choice([0.0, 1.0], (draws, n, m)), rng.random((draws, n, m)))
+        # some start where the certificate is tight
+        tight = (np.arange(draws) % 5 == 0)[:, None, None]
+        self.x = np.where(
+            tight, claims.v_late / claims.v_late.max(axis=(-1, -2), keepdims=True), self.x
+        )
         below = rng.random((draws, n, 1)) * self.x
         self.xhat = np.where(self.exact[:, None, None], self.x, np.where(corner, 0.0, below))
-        self.s = rng.random((draws, 1, m))
-        self.memory = [self.xhat] * (max_delay + 1)
-        self.last = self.xhat
+        # certificate D is about a leader at rest: zero is a solution of the agent
+        self.rest = self.delayed & self.exact
+        self.s = np.where(self.rest[:, None, None], 0.0, rng.random((draws, 1, m)))
+        zero = self.delayed.astype(int)[:, None, None] * np.zeros((1, n, n), dtype=int)
+        self.age = np.where(self.always[:, None, None], self.oldest, zero)
+        # before the start the leader's followers were as far off as the claim allows
+        back = self.rest[:, None, None] * np.log(claims.late_factor or 1.0)
+        self.sent = [self.xhat * np.exp(-k * back) for k in range(self.oldest + 1)]
+        self.missed = [self.x - self.xhat] * (self.oldest + 1)
 
-    def run(self, periods: int) -> tuple[float, float, float, float]:
-        """Least state, worst factors of tracking and estimation, growth."""
-        least, tracking, observer = 0.0, 0.0, 0.0
+    def run(self, periods: int) -> _Found:
+        """Look for the worst over some periods."""
+        least, tracking, observer, late, observer_late = 0.0, 0.0, 0.0, 0.0, 0.0
         start = np.abs(self.x - self.s).max(axis=(1, 2))
+        first = self._norms()
+        fresh = ~self.delayed | (self.loop.observer == "local")
+        slow = [c or 1.0 for c in (self.claims.late_factor, self.claims.observer_late_factor)]
         with np.errstate(over="ignore", invalid="ignore"):
-            for _ in range(periods):
+            for k in range(1, periods + 1):
                 before = self._norms()
                 least = min(least, self._step())
                 after = self._norms()
                 fair = self.exact & ~self.delayed & (before[0] > 1e-12)
                 tracking = max(tracking, _worst(after[0], before[0], fair))
-                observer = max(observer, _worst(after[1], before[1], before[1] > 1e-12))
+                observer = max(observer, _worst(after[1], before[1], fresh & (before[1] > 1e-12)))
+                late = max(
+                    late, _worst(after[2], first[2] * slow[0] ** k, self.rest & (first[2] > 0))
+                )
+                some = self.delayed & (first[3] > 0)
+                observer_late = max(observer_late, _worst(after[3], first[3] * slow[1] ** k, some))
             end = np.abs(self.x - self.s).max(axis=(1, 2))
             growth = float(np.nan_to_num(end / np.maximum(start, 1e-12), nan=np.inf).max())
-        return least, tracking, observer, growth
+        return _Found(least, tracking, observer, late, observer_late, growth)
 
-    def _norms(self) -> tuple[Array, Array]:
-        tracking = np.abs(self.xhat - self.s) / self.claims.v
-        estimation = np.abs(self.x - self.xhat) / self.claims.v_observer
-        return tracking.max(axis=(1, 2)), estimation.max(axis=(1, 2))
+    def _norms(self) -> tuple[Array, ...]:
+        """Of tracking and estimation error, then the same with the weights for late messages."""
+        claims, off, e = self.claims, self.xhat - self.s, self.x - self.xhat
+        late = (off, claims.v_late), (e, claims.v_observer_late)
+        pairs = ((off, claims.v), (e, claims.v_observer), *late)
+        return tuple((np.abs(z) / v).max(axis=(1, 2)) for z, v in pairs)
 
-    def _received(self) -> Array:
-        """Estimates of neighbours as they arrive: late or lost in the draws with delays."""
-        late = self.memory[int(self.rng.integers(0, self.max_delay + 1))]
-        fresh = np.where(self.delayed[:, None, None], late, self.xhat)
-        lost = self.delayed[:, None, None] & (self.rng.random((self.draws, 1, 1)) < self.loss)
-        self.last = np.where(lost, self.last, fresh)
-        return self.last
+    def _messages(self) -> None:
+        """Let messages arrive, late or not at all: the age of what every arc uses."""
+        if self.oldest == 0:
+            return
+        shape = self.age.shape
+        fresh = self.rng.integers(0, self.max_delay + 1, shape)
+        lost = (self.rng.random(shape) < self.loss) & (self.age < self.oldest)
+        age = np.where(lost, self.age + 1, fresh)
+        age = np.where(self.always[:, None, None], self.oldest, age)
+        self.age = np.where(self.delayed[:, None, None], age, 0)
+
+    def _near(self, memory: list[Array]) -> Array:
+        """Add up over heard agents what their messages say: ``Σ_j a_ij z_j``."""
+        if self.oldest == 0:
+            return np.asarray(self.graph.adjacency @ memory[0])
+        total = np.zeros_like(memory[0])
+        for k, z in enumerate(memory):
+            total += (self.graph.adjacency * (self.age == k)) @ z
+        return total
 
     def _step(self) -> float:
         loop, agent = self.loop, self.loop.agent
         graph, d = self.graph, self.graph.d
         sign = -1.0 if loop.protocol == "printed" else 1.0
-        received = self._received()
-        w = graph.degree * self.xhat - graph.near(received) + sign * d * (self.xhat - self.s)
+        self._messages()
+        self.sent[0], self.missed[0] = self.xhat, self.x - self.xhat
+        near = self._near(self.sent)
+        w = graph.degree * self.xhat - near + sign * d * (self.xhat - self.s)
         u = loop.phi * w @ loop.K.T
         gains = self.rng.choice([agent.sector[0], agent.sector[1]], u.shape)
         push = (gains * u) @ agent.B.T
         e = self.x - self.xhat
         if loop.observer == "distributed":
-            e = loop.mu * (graph.degree * e - graph.near(e) + d * e)
+            e = loop.mu * (graph.degree * e - self._near(self.missed) + d * e)
         innovation = e @ (loop.E @ agent.C).T
         pick = self.rng.integers(0, len(self.Phi), self.draws)
         least = 0.0
@@ -320,7 +419,8 @@ class _Batch:
             )
             least = min(least, *(_least(z) for z in (x, xhat, x - xhat)))
         self.s = np.einsum("dij,dnj->dni", self.Phi[pick, -1], self.s)
-        self.memory = [self.xhat, *self.memory[:-1]]
+        self.sent = [self.xhat, *self.sent[:-1]]
+        self.missed = [self.x - self.xhat, *self.missed[:-1]]
         self.x, self.xhat = x, xhat
         return least
 

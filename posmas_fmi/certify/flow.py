@@ -90,6 +90,15 @@ class Flow:
 
     def over(self, h: float) -> tuple[Interval, Interval, Interval, Interval]:
         """``e^{A_low h}``, ``e^{A_high h}``, ``Γ(A_low)``, ``Γ(A_high)``, each (m, m)."""
+        if h not in self._known:
+            self._known[h] = self._over(h)
+        return self._known[h]
+
+    @cached_property
+    def _known(self) -> dict[float, tuple[Interval, Interval, Interval, Interval]]:
+        return {}
+
+    def _over(self, h: float) -> tuple[Interval, Interval, Interval, Interval]:
         times = np.array([h])
         factor = exp_scalar(-(point(self.sigma) * point(h)))
         parts = []

@@ -20,8 +20,8 @@ class Trajectory:
         At the end.
     s : (m,) array
         Leader at the end.
-    least : float
-        Smallest entry of any state on the way.
+    least, least_estimate : float
+        Smallest entry of any state, and of any estimate, on the way.
     error : float
         Largest ``|x_i - s|`` at the end.
     """
@@ -30,6 +30,7 @@ class Trajectory:
     xhat: Array
     s: Array
     least: float
+    least_estimate: float
     error: float
 
 
@@ -63,7 +64,7 @@ def simulate(
         return np.asarray(free)
 
     z = np.vstack([x, xhat, s[None]]).astype(float)
-    least, t = float(z[:n].min()), 0.0
+    least, least_estimate, t = float(z[:n].min()), float(z[n : 2 * n].min()), 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(round(until / step)):
             t = k * step
@@ -73,7 +74,9 @@ def simulate(
             e = slope(t + step, z + step * c)
             z = z + step / 6 * (a + 2 * b + 2 * c + e)
             least = min(least, float(np.nan_to_num(z[:n], nan=-np.inf).min()))
+            estimate = float(np.nan_to_num(z[n : 2 * n], nan=-np.inf).min())
+            least_estimate = min(least_estimate, estimate)
             if not np.isfinite(z).all():
                 break
     error = float(np.abs(z[:n] - z[2 * n]).max())
-    return Trajectory(z[:n, :m], z[n : 2 * n], z[2 * n], least, error)
+    return Trajectory(z[:n, :m], z[n : 2 * n], z[2 * n], least, least_estimate, error)

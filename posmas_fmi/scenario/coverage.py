@@ -26,19 +26,17 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
         ``what``, ``covered`` (bool) and ``why``. Empty: nothing beyond the nominal loop.
     """
     proved = designed.certificate.certified != "no"
-    local = designed.observer == "local"
     rows: list[tuple[str, bool, str]] = []
     channel = scenario.channel
     arcs: list[ChannelTable | ArcTable] = [channel, *channel.arc]
     if any(c.delay or c.jitter for c in arcs):
-        rows.append(("delay of messages", proved and local, _delays(proved, local)))
+        rows.append(("delay of messages", proved, _delays(designed)))
     if any(c.loss >= 1.0 for c in arcs):
         rows.append(
             ("arcs over which nothing ever arrives", False, "what is held there never changes")
         )
     elif any(c.loss for c in arcs):
-        why = _delays(proved, local)
-        rows.append(("loss of messages", proved and local, f"{why}; with probability one"))
+        rows.append(("loss of messages", proved, f"{_delays(designed)}; with probability one"))
     if channel.resolution:
         rows.append(
             (
@@ -71,9 +69,12 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
     return [{"what": what, "covered": covered, "why": why} for what, covered, why in rows]
 
 
-def _delays(proved: bool, local: bool) -> str:
-    if not proved:
+def _delays(designed: Design) -> str:
+    if designed.certificate.certified == "no":
         return "nothing is proved"
-    if not local:
-        return "the distributed observer needs its neighbours' output errors undelayed"
-    return "certificate D: the last message is held, convergence and positivity stay"
+    slower = [f"{d.rate:.3g} 1/s at {d.delay:.3g} s" for d in designed.certificate.delays[::3]]
+    rates = f"; certified rate {', '.join(slower)}" if slower else ""
+    stays = "convergence and positivity stay"
+    if designed.observer == "distributed":
+        stays = "convergence stays, also where output errors are as late"
+    return f"certificate D: the last message is held, {stays}{rates}"
