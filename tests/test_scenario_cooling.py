@@ -15,10 +15,21 @@ import pytest
 from posmas_fmi import cli, load, run
 from posmas_fmi.cooling import Loads, controller
 from posmas_fmi.cooling.row import Row, simulate_row
+from posmas_fmi.cosim import engine
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.network import network_from_arcs
+from posmas_fmi.scenario.build import shipped_scenarios
+from posmas_fmi.scenario.compare import controllers
 from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law
-from posmas_fmi.scenario.job import make_design_of, run_designed
+from posmas_fmi.scenario.job import (
+    extras,
+    law_network,
+    make_design_of,
+    make_system,
+    run_designed,
+)
+from posmas_fmi.scenario.plant import fmu_files, make_instances
+from posmas_fmi.scenario.tables import CompareTable, ControlTable
 
 pytestmark = pytest.mark.slow
 
@@ -118,7 +129,8 @@ def test_controllers_of_a_comparison_have_the_same_loads_and_start(compared) -> 
 
 
 def test_a_scenario_runs_as_the_same_row_from_python(row, designed, tmp_path) -> None:
-    exact = attrs.evolve(row, sensors=None, compare=None)
+    plant = attrs.evolve(row.plant, tolerance=None)
+    exact = attrs.evolve(row, sensors=None, compare=None, plant=plant)
     run_designed(exact, designed, tmp_path / "out", report=False)
     network = network_from_arcs(3, [(3, 1), (1, 2), (2, 3)], [1])
     expected = simulate_row(
@@ -172,9 +184,6 @@ def test_mistakes_are_named(tmp_path, old, new, message) -> None:
 
 
 def test_unknown_laws_and_parameters_are_named(row, designed) -> None:
-    from posmas_fmi.scenario.compare import controllers
-    from posmas_fmi.scenario.tables import CompareTable, ControlTable
-
     with pytest.raises(InputError, match=r"parameters.kq: unknown key; known keys: K, K_q"):
         cooling_law(ControlTable("integral", {"kq": -1.0}), row.cooling, designed)
     with pytest.raises(InputError, match="expected a number > 0"):
@@ -201,3 +210,27 @@ def test_the_command_prints_a_table(compared) -> None:
     assert printed.splitlines()[0].split() == ["integral_ff", "slow"]
     assert "RMS deviation [K]" in printed
     assert "slow: " in printed
+
+
+SHIPPED = [path.stem for path in shipped_scenarios() if path.stem.startswith("cooling")]
+
+
+def test_the_shipped_rows_are_there() -> None:
+    assert len(SHIPPED) == 10
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_row_runs(name, designed) -> None:
+    """Every controller for a minute, with the gains of another row."""
+    scenario = load(name, until=60.0, seed=2)
+    tables = controllers(scenario) if scenario.compare else {"one": scenario.control}
+    own = attrs.evolve(designed, network=scenario.network)
+    for table in tables.values():
+        one = attrs.evolve(scenario, control=table, compare=None)
+        network = law_network(one, own)
+        made = attrs.evolve(own, network=network)
+        instances = make_instances(one, fmu_files(one), extras(one))
+        with instances.start() as plant:
+            outcome = engine.run(make_system(one, made, instances), plant)
+        assert outcome.ended == "complete"
+        assert outcome.messages > 0

@@ -87,7 +87,8 @@ def return_range(line: LineParameters, loads: tuple[float, float] = LOADS) -> tu
     """Range of the steady return temperature θr over a range of loads [K].
 
     From the nominal valve position, where θr follows the load most, to a valve that holds the
-    supply temperature. (θr rises with the load in both: A is Metzler and Hurwitz.)
+    supply temperature, or is open where that is not enough. (θr rises with the load in both: A is
+    Metzler and Hurwitz.)
 
     Parameters
     ----------
@@ -110,9 +111,17 @@ def return_range(line: LineParameters, loads: tuple[float, float] = LOADS) -> tu
     ends = []
     for load in loads:
         fixed = line.steady(load)[1]
-        held = line.steady(load, line.position(load))[1]
+        held = line.steady(load, _holding(line, load))[1]
         ends.append((min(fixed, held), max(fixed, held)))
     return float(ends[0][0]), float(ends[1][1])
+
+
+def _holding(line: LineParameters, load: float) -> float:
+    """Valve position that holds the supply temperature, or the nearest to it."""
+    try:
+        return line.position(load)
+    except InputError:
+        return float(load > line.P0)
 
 
 def sector(

@@ -49,6 +49,7 @@ RECORDED = (
     "header",
     "facility_temperature",
 )
+TOLERANCE = 1e-6  # of the solver in the FMUs: some 1e-5 K, a thousandth of the sensors' noise
 # Integral time [s] of the integral law over its proportional part: stable with room to spare at
 # every period that a design certifies (benchmarks/cooling.py).
 INTEGRAL_TIME = 44.0
@@ -80,7 +81,8 @@ def expand(
 ) -> dict[str, Any]:
     """Return the tables that ``[cooling]`` stands for, as TOML would give them.
 
-    Lines start in the steady state of their first load with the valve at its nominal position.
+    Lines start in the steady state of their first load at the set-point, if a valve position holds
+    it.
 
     Parameters
     ----------
@@ -112,10 +114,7 @@ def expand(
         scenario.seed,
     )
     first = np.broadcast_to(load.at(np.zeros(1))[0], (n,))
-    values = [
-        line_values(line.sized(float(s) * line.P0), float(p), facility=cooling.facility)
-        for s, p in zip(size, first, strict=True)
-    ]
+    values = [_start(cooling, float(s), float(p)) for s, p in zip(size, first, strict=True)]
     common = values[0]
     start = [[v["T_plate"], v["T_return"], v["T_supply"]] for v in values]
     above = (np.array(start) - cooling.facility).tolist()
@@ -127,6 +126,7 @@ def expand(
         "plant": {
             **_ports(cooling, line),
             "parameters": common,
+            "tolerance": TOLERANCE,
             "override": [
                 {"agent": k + 1, "parameters": different}
                 for k, own in enumerate(values)
@@ -142,6 +142,16 @@ def expand(
         "sensors": {"noise": cooling.noise, "resolution": cooling.resolution},
         "report": {"baseline": False},
     }
+
+
+def _start(cooling: CoolingTable, size: float, load: float) -> dict[str, float]:
+    """Values of the FMU of a line that holds the set-point, or is as near to it as it can be."""
+    line = NOMINAL.sized(size * NOMINAL.P0)
+    try:
+        y = line.position(load, cooling.set_point)
+    except InputError:
+        y = float(load > line.P0)
+    return line_values(line, load, y, cooling.facility)
 
 
 def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
