@@ -101,7 +101,11 @@ def parse(text: str, variables: Sequence[str], where: str = "") -> sympy.Expr:
         raise ExpressionError(f"cannot read {_shorten(text)!r}: {reason}", where) from None
     if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         raise ExpressionError(f"expected at most {MAX_NODES} terms; split the expression", where)
-    return _Builder(tuple(variables), text, where).build(tree.body, 0)
+    try:
+        return _Builder(tuple(variables), text, where).build(tree.body, 0)
+    except (MemoryError, RecursionError, ArithmeticError, TypeError, ValueError) as error:
+        reason = f"it cannot be worked out ({type(error).__name__})"
+        raise ExpressionError(f"cannot read {_shorten(text)!r}: {reason}", where) from error
 
 
 def _nesting(text: str) -> int:
@@ -202,10 +206,13 @@ class _Builder:
     def finite(self, expr: sympy.Expr) -> sympy.Expr:
         if expr.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo):
             raise self.refuse("the expression has no finite value")
-        if expr.is_number and not expr.is_real:
-            raise self.refuse("the expression is not real")
-        if expr.is_Rational and not math.isfinite(_as_float(expr)):
+        if not expr.is_number:
+            return expr
+        # before SymPy is asked more: exact answers about huge numbers fill the memory
+        if not math.isfinite(_as_float(expr)):
             raise self.refuse("a constant is too large for a double")
+        if not expr.is_real:
+            raise self.refuse("the expression is not real")
         return expr
 
     def refuse(self, reason: str) -> ExpressionError:
@@ -217,6 +224,8 @@ def _as_float(value: Any) -> float:
         return float(value)
     except OverflowError:
         return math.inf
+    except TypeError:  # a complex number
+        return 0.0
 
 
 def _nested(function: str, args: list[str]) -> str:

@@ -32,6 +32,9 @@ HOSTILE = [
     "1/0",
     "0**-1",
     "log(0)",
+    "exp(1000)",
+    "sin(exp(exp(20)))",
+    "4**14**1.2**4**14**1.2**1",  # found by fuzzing: it filled the memory
     "sqrt(-1)",
     "x1**x1",
     "(-2)**x1",

@@ -1,0 +1,75 @@
+"""Readers of what strangers wrote end with typed errors only, whatever the bytes are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from fuzz.readers import READERS, beginnings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+WORDS = [
+    *("x1", "x2", "t", "u1", "x9", "sin", "exp", "sqrt", "log", "min", "clip", "abs", "sign"),
+    *("+", "-", "*", "/", "**", "(", ")", ",", "<", "if", "else", "0", "1e308", "1e999", "0.1"),
+    *("9" * 30, "lambda", "__import__", "'", '"', ".", "[", "]", "=", "\n", " ", "\0", "é"),
+]
+VALUES = [
+    *("0", "-1", "1e308", "nan", "inf", "-inf", "true", '""', '"x"', "[]", "[[]]", "{}", "1e-300"),
+    *("9999999999999999999", "2024-01-01", '"../../etc/passwd"', "[1, 'a']", "[nan]", "[[1.0]]"),
+]
+
+
+@st.composite
+def spoiled(draw: Callable, reader: str) -> bytes:
+    """Good bytes with some parts replaced, removed or doubled."""
+    data = draw(st.sampled_from(beginnings(reader)))
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(data)))
+        end = min(len(data), at + draw(st.sampled_from([0, 1, 1, 2, 4, 8, 100])))
+        new = draw(st.one_of(st.binary(max_size=8), st.just(data[at:end] * 2)))
+        data = data[:at] + new + data[end:]
+    return data
+
+
+@st.composite
+def other_values(draw: Callable) -> bytes:
+    """A scenario with other values, lines left out, lines twice."""
+    lines = draw(st.sampled_from(beginnings("scenario"))).decode().splitlines()
+    for _ in range(draw(st.integers(1, 3))):
+        k = draw(st.integers(0, len(lines) - 1))
+        key, equals, _ = lines[k].partition("=")
+        kind = draw(st.sampled_from(["value", "value", "value", "without", "twice"]))
+        if kind == "value" and equals:
+            lines[k] = f"{key}= {draw(st.sampled_from(VALUES))}"
+        elif kind == "without":
+            lines[k] = ""
+        elif kind == "twice":
+            lines.insert(k, lines[k])
+    return "\n".join(lines).encode()
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_the_beginnings_are_read(reader: str) -> None:
+    assert beginnings(reader)
+    for data in beginnings(reader):
+        READERS[reader](data)
+
+
+@pytest.mark.parametrize("reader", READERS)
+@settings(max_examples=60)
+@given(data=st.data())
+def test_spoiled_bytes(reader: str, data: st.DataObject) -> None:
+    READERS[reader](data.draw(spoiled(reader)))
+
+
+@settings(max_examples=100)
+@given(words=st.lists(st.sampled_from(WORDS), max_size=12))
+def test_expressions_of_any_words(words: list[str]) -> None:
+    READERS["expression"]("".join(words).encode())
+
+
+@settings(max_examples=100)
+@given(data=other_values())
+def test_scenarios_with_any_values(data: bytes) -> None:
+    READERS["scenario"](data)
