@@ -22,6 +22,7 @@ from posmas_fmi.fmu.clocks import read_clocks
 from posmas_fmi.fmu.compile import host, shared_library
 from posmas_fmi.fmu.event_mode import EventFile, EventInstance
 from posmas_fmi.fmu.open import open_fmu
+from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.stepped import SteppedInstance
 
 CLOCKED = Path(__file__).parent / "clocked"
@@ -111,6 +112,10 @@ def test_a_tick_between_points_of_an_fmu_with_equal_steps(clocked: Path, tmp_pat
     old = b'canHandleVariableCommunicationStepSize="true"'
     equal = described(clocked, tmp_path / "equal.fmu", old, b"")
     with open_fmu(equal) as file, file.instantiate("s") as instance:
+        assert [check_period(file, h).allowed for h in (0.1, 0.2, 0.05, 0.15, 0.4)] == [
+            *(True, True, True, False, False)
+        ]
+        assert [check_period(file, h).nearest for h in (0.15, 0.4, 0.11)] == [0.2, 0.2, 0.1]
         instance.initialise()
         instance.do_step(0.0, 0.15)
         instance.do_step(0.15, 0.15)

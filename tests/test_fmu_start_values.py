@@ -6,7 +6,9 @@ import json
 import logging
 from pathlib import Path
 
+import numpy as np
 import pytest
+from fmu_examples import example_1
 from fmu_scenarios import one_fmu
 
 from posmas_fmi import load, run
@@ -99,3 +101,12 @@ def test_a_name_that_is_not_there_is_a_mistake(pump: Path, tmp_path: Path) -> No
     path = scenario(pump, tmp_path, "limits = 1.0")
     with pytest.raises(InputError, match="no variable 'limits'; did you mean 'limit'"):
         run(load(path), tmp_path / "out", report=False)
+
+
+def test_arrays_are_start_values(tmp_path: Path) -> None:
+    example = example_1()
+    with FmuFile(example.fmu(3, tmp_path)) as file, file.instantiate("a") as instance:
+        values = {**example.matrices, "x": np.array([1.0, 0.3])}
+        kept, refused = settable(file.about, values)
+        instance.initialise(kept)
+        assert (list(kept), refused, read_back(instance, kept)) == (list(values), [], [])

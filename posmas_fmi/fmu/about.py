@@ -11,7 +11,8 @@ import attrs
 import numpy as np
 
 from posmas_fmi.errors import ArchiveError, FmuError, InputError
-from posmas_fmi.fmu.archive import examine
+from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry
+from posmas_fmi.fmu.clocks import Clock, read_clocks
 from posmas_fmi.fmu.units import Conversion, Units
 from posmas_fmi.fmu.variables import Ports, Variable, Variables
 
@@ -105,6 +106,13 @@ class About:
     def units(self) -> Units:
         """The units that it defines."""
         return Units.read(self.description)
+
+    @cached_property
+    def clocks(self) -> tuple[Clock, ...]:
+        """Input clocks that time makes tick."""
+        if not any(variable.type == "Clock" for variable in self.variables.values()):
+            return ()
+        return read_clocks(read_entry(self.path, DESCRIPTION))
 
     def variable(self, name: str) -> Variable:
         """Return the variable of that name, or the array that has that element (``u[1]``).

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from posmas_fmi.errors import FmuError
 from posmas_fmi.fmu.about import About
-from posmas_fmi.fmu.clocks import Clock, read_clocks
+from posmas_fmi.fmu.clocks import Clock
 from posmas_fmi.fmu.events import settle
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
@@ -56,10 +56,10 @@ class EventFile(FmuFile):
         """True: events are handled here."""
         return True
 
-    @cached_property
+    @property
     def clocks(self) -> tuple[Clock, ...]:
         """Input clocks that time makes tick."""
-        return read_clocks((self.folder / "modelDescription.xml").read_bytes())
+        return self.about.clocks
 
     @cached_property
     def clocked(self) -> dict[str, tuple[int, ...]]:

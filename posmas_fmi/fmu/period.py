@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from math import gcd
 from typing import Any
 
 import attrs
@@ -81,7 +82,8 @@ def check_period(file: FmuFile | About, period: float, *, last: float | None = N
     -----
     Two attributes of the model description restrict it: ``fixedInternalStepSize`` (FMI 3.0), of
     which a period is a whole multiple, and ``canHandleVariableCommunicationStepSize``, without
-    which all steps have the same length. For a Model Exchange FMU neither holds.
+    which all steps have the same length, so that clocks can tick at communication points only. For
+    a Model Exchange FMU neither holds.
     """
     fixed = _number(getattr(_interface(file), "fixedInternalStepSize", None))
     for length in (period, *(() if last is None else (last,))):
@@ -104,7 +106,35 @@ def check_period(file: FmuFile | About, period: float, *, last: float | None = N
             f"(the last one would take {last:g} s instead of {period:g} s)",
             period,
         )
+    return _ticks_at_points(file, period)
+
+
+def _ticks_at_points(file: FmuFile | About, period: float) -> PeriodCheck:
+    """Whether clocks tick at communication points, where they cannot in between."""
+    about = file if isinstance(file, About) else file.about
+    if allows_steps_of_different_length(file):
+        return PeriodCheck(True)
+    for clock in about.clocks:
+        if not clock.periodic or clock.interval is None:
+            continue
+        interval, shift = float(clock.interval), float(clock.shift)
+        if not (_multiple(interval, period) and (not shift or _multiple(shift, period))):
+            grid = _common(clock.interval, clock.shift)
+            nearest = float(grid / max(1, round(float(grid) / period)))
+            return PeriodCheck(
+                False,
+                f"its clock {clock.name!r} ticks every {interval:g} s, between communication "
+                f"points, and it takes no steps of different length; the nearest is {nearest:g} s",
+                nearest,
+            )
     return PeriodCheck(True)
+
+
+def _common(interval: Fraction, shift: Fraction) -> Fraction:
+    """Largest time that both are whole multiples of."""
+    denominator = interval.denominator * shift.denominator
+    whole = gcd(int(interval * denominator), int(shift * denominator))
+    return Fraction(whole, denominator)
 
 
 def allows_steps_of_different_length(file: FmuFile | About) -> bool:
