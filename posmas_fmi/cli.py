@@ -57,7 +57,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace) -> int:
     from posmas_fmi.scenario import load, run
 
-    scenario = load(arguments.scenario, arguments.period, arguments.until, arguments.seed)
+    scenario = load(
+        arguments.scenario,
+        arguments.period,
+        arguments.until,
+        arguments.seed,
+        arguments.outside,
+    )
     if arguments.schedule:
         from posmas_fmi.scenario.schedule import schedule_of
 
@@ -106,7 +112,7 @@ def _design(arguments: argparse.Namespace) -> int:
     from posmas_fmi.scenario import load
     from posmas_fmi.scenario.job import make_design_of
 
-    scenario = load(arguments.scenario)
+    scenario = load(arguments.scenario, outside=arguments.outside)
     if arguments.method:
         settings = attrs.evolve(scenario.design, method=arguments.method)
         scenario = attrs.evolve(scenario, design=settings)
@@ -118,7 +124,7 @@ def _certify(arguments: argparse.Namespace) -> int:
     from posmas_fmi.scenario import load
     from posmas_fmi.scenario.job import pinned_network
 
-    scenario = load(arguments.scenario)
+    scenario = load(arguments.scenario, outside=arguments.outside)
     K, E = _read_gains(arguments.gains)
     network, _ = pinned_network(scenario)
     made = certify(scenario.agent, network, K, E, scenario.design, scenario.clock.h)
@@ -401,6 +407,8 @@ def _parser() -> argparse.ArgumentParser:
 
     run = add("run", _run, "design, certify, co-simulate, report")
     run.add_argument("scenario", help=_SCENARIO)
+    outside = "the scenario may name files outside its folder"
+    run.add_argument("--outside", action="store_true", help=outside)
     run.add_argument("--out", type=Path, metavar="DIR", help="output folder (default out/<name>)")
     run.add_argument("--until", type=_positive, metavar="S", help="end of the run [s]")
     run.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
@@ -420,6 +428,7 @@ def _parser() -> argparse.ArgumentParser:
 
     design = add("design", _design, "find gains and prove what they do")
     design.add_argument("scenario", help=_SCENARIO)
+    design.add_argument("--outside", action="store_true", help=outside)
     design.add_argument(
         "--method",
         choices=("contraction", "lmi", "paper-1", "paper-2"),
@@ -429,6 +438,7 @@ def _parser() -> argparse.ArgumentParser:
 
     certify = add("certify", _certify, "certificate for given gains")
     certify.add_argument("scenario", help=_SCENARIO)
+    certify.add_argument("--outside", action="store_true", help=outside)
     certify.add_argument(
         "--gains",
         type=Path,

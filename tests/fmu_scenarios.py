@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 ONE = """
@@ -46,8 +47,11 @@ def one_fmu(
 ) -> str:
     """Write a scenario of two agents that have this FMU; returns its path."""
     given = {"until": 1.0, "period": 0.1, "engine": "auto", "gain": 0.0, **other}
+    if fmu.parent != folder:  # scenarios name files of their own folder
+        fmu = Path(shutil.copy(fmu, folder))
     path = folder / "one.toml"
     path.write_text(
-        ONE.format(fmu=fmu, inputs=inputs, outputs=outputs, more=more, **given), encoding="utf-8"
+        ONE.format(fmu=fmu.name, inputs=inputs, outputs=outputs, more=more, **given),
+        encoding="utf-8",
     )
     return str(path)

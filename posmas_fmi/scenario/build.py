@@ -157,6 +157,7 @@ def load(
     period: float | None = None,
     until: float | None = None,
     seed: int | None = None,
+    outside: bool = False,
 ) -> Scenario:
     """Read and check a scenario.
 
@@ -168,6 +169,9 @@ def load(
         Replace those of the file [s].
     seed : int, optional
         Replaces that of the file.
+    outside : bool
+        Whether the scenario may name files outside its own folder. FMUs and controllers are code:
+        leave it off for scenarios of others.
 
     Returns
     -------
@@ -186,19 +190,20 @@ def load(
     path = find(name_or_path)
     given: dict[str, Any] = {"period": period, "until": until, "seed": seed}
     tables, text = read_tables(path, {k: v for k, v in given.items() if v is not None})
-    return _Builder(tables, path, text).build()
+    return _Builder(tables, path, text, outside).build()
 
 
 class _Builder:
     """Builds part by part and gathers the problems of all parts."""
 
-    def __init__(self, tables: ScenarioFile, path: Path, text: str) -> None:
-        self.tables, self.path, self.text = tables, path, text
+    def __init__(self, tables: ScenarioFile, path: Path, text: str, outside: bool) -> None:
+        self.tables, self.path, self.text, self.outside = tables, path, text, outside
         self.problems: list[tuple[str, str]] = []
 
     def build(self) -> Scenario:
         tables = self.tables
         self.check_name()
+        self.check_paths()
         clock = self.attempt(lambda: Clock.of(tables.scenario.until, tables.scenario.period))
         agent = self.attempt(lambda: make_agent(tables.agent))
         network = self.attempt(lambda: make_network(tables.network, self.path.parent))
@@ -318,6 +323,21 @@ class _Builder:
             self.problems += [(place or "$", message) for place, message in error.problems]
         return None
 
+    def check_paths(self) -> None:
+        """Files must lie in the scenario's folder, unless the caller allows others."""
+        if self.outside:
+            return
+        folder = self.path.parent.resolve()
+        for place, name in _named_files(self.tables):
+            if not (folder / name).resolve().is_relative_to(folder):
+                self.problems.append(
+                    (
+                        place,
+                        f"{name!r} lies outside the scenario's folder; if you trust the scenario "
+                        "allow that with --outside (load(…, outside=True))",
+                    )
+                )
+
     def check_name(self) -> None:
         name = self.tables.scenario.name
         if not name or name in (".", "..") or any(c in name for c in '/\\:*?"<>|\0\n'):
@@ -339,6 +359,21 @@ class _Builder:
             )
         if self.tables.scenario.threads < 1:
             self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
+
+
+def _named_files(tables: ScenarioFile) -> list[tuple[str, str]]:
+    """Every file that a scenario names, with its place; also names that may be shipped FMUs."""
+    controls = {"$.control.python": tables.control.python}
+    controls |= {f"$.controllers.{n}.python": c.python for n, c in tables.controllers.items()}
+    named: list[tuple[str, str | None]] = [
+        ("$.network.file", tables.network.file),
+        ("$.plant.fmu", tables.plant.fmu),
+        *((f"$.signals.{name}.file", signal.file) for name, signal in tables.signals.items()),
+        *((f"$.plant.override[{k}].fmu", o.fmu) for k, o in enumerate(tables.plant.override)),
+        *((f"$.component[{k}].fmu", c.fmu) for k, c in enumerate(tables.component)),
+        *((place, text and text.rpartition(":")[0]) for place, text in controls.items()),
+    ]
+    return [(place, name) for place, name in named if name]
 
 
 def _columns(signals: dict[str, Signal], tables: dict[str, SignalTable]) -> dict[str, Columns]:

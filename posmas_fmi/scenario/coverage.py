@@ -27,6 +27,14 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
     """
     proved = designed.certificate.certified != "no"
     rows: list[tuple[str, bool, str]] = []
+    if scenario.control.python is not None:
+        rows.append(
+            (
+                "controllers of one's own",
+                False,
+                "what is proved is about [design]'s gains",
+            )
+        )
     channel = scenario.channel
     arcs: list[ChannelTable | ArcTable] = [channel, *channel.arc]
     if any(c.delay or c.jitter for c in arcs):

@@ -305,6 +305,21 @@ def _without_control(
     return outcome
 
 
+def _own_law(scenario: Scenario, designed: Design) -> Law:
+    """Return controllers of the user's own."""
+    from posmas_fmi.cosim.python_law import PythonLaw, load_class
+
+    made = load_class(str(scenario.control.python), scenario.path.parent)
+    parameters = scenario.control.parameters
+    try:
+        if hasattr(made, "step_all"):
+            return PythonLaw(scenario.agent, designed.network, made(**parameters))
+        each = [made(k + 1, **parameters) for k in range(designed.network.N)]
+    except TypeError as error:
+        raise InputError(f"cannot be made: {error}", "$.control.python") from error
+    return PythonLaw(scenario.agent, designed.network, each)
+
+
 def make_law(scenario: Scenario, designed: Design) -> Law:
     """Return the controllers of the agents, as ``[control]`` says.
 
@@ -313,6 +328,8 @@ def make_law(scenario: Scenario, designed: Design) -> Law:
     InputError
         If the law or a parameter is not known.
     """
+    if scenario.control.python is not None:
+        return _own_law(scenario, designed)
     if scenario.cooling is not None and scenario.control.law != "protocol":
         from posmas_fmi.scenario.cooling import cooling_law
 
@@ -339,6 +356,11 @@ def make_law(scenario: Scenario, designed: Design) -> Law:
 
 def extras(scenario: Scenario) -> tuple[str, ...]:
     """Return what the law measures beside y."""
+    if scenario.control.python is not None:
+        from posmas_fmi.cosim.python_law import load_class
+
+        made = load_class(scenario.control.python, scenario.path.parent)
+        return tuple(getattr(made, "extras", ()))
     if scenario.cooling is None or scenario.control.law == "protocol":
         return ()
     from posmas_fmi.cooling.control import EXTRAS

@@ -1,0 +1,109 @@
+"""Files that a scenario names, controllers of one's own among them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from test_scenario_faults import scenario
+
+from posmas_fmi import load, run
+from posmas_fmi.cli import main
+from posmas_fmi.errors import InputError, ScenarioError
+
+MINE = """
+import numpy as np
+
+
+class Mine:
+    def __init__(self, number, gain=1.0):
+        self.number, self.gain = number, gain
+
+    def step(self, t, y, neighbours, s):
+        target = neighbours.mean(axis=0) if s is None else y
+        return self.gain * (target - y).sum()
+
+
+class Central:
+    def __init__(self, gain=1.0):
+        self.gain = gain
+
+    def step_all(self, t, Y, s):
+        return np.zeros((len(Y), 1)) + self.gain
+"""
+
+
+@pytest.mark.parametrize("name", ["Mine", "Central"])
+def test_controllers_of_ones_own(name: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(MINE)
+    control = f'[control]\npython = "mine.py:{name}"\nparameters = {{gain = 0.25}}\n'
+    made = run(load(scenario(tmp_path, control), until=0.5), tmp_path / "out", report=False)
+    covered = {row["what"]: row["covered"] for row in made.summary["coverage"]}
+    assert covered["controllers of one's own"] is False
+    with xarray.open_dataset(tmp_path / "out" / "results.nc") as data:
+        u, y = data["u"].values, data["y"].values
+    if name == "Central":
+        np.testing.assert_array_equal(u, np.full_like(u, 0.25))
+    else:  # agent 1 hears agents 2 and 3
+        expected = 0.25 * (y[:, [1, 2]].mean(axis=1) - y[:, 0]).sum(axis=1)
+        np.testing.assert_allclose(u[:, 0, 0], expected, rtol=1e-12)
+
+
+WRONG = {
+    "no class": ('python = "mine.py:None_"', "has no class"),
+    "parameters": ('python = "mine.py:Mine"\nparameters = {speed = 1}', "cannot be made"),
+    "no file": ('python = "other.py:Mine"', "beside the scenario"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_controllers_that_cannot_be_had(name: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(MINE)
+    text, message = WRONG[name]
+    with pytest.raises(InputError, match=message) as caught:
+        run(load(scenario(tmp_path, f"[control]\n{text}\n"), until=0.1), tmp_path / "out")
+    assert "$.control.python" in str(caught.value)
+
+
+OUTSIDE = {
+    "$.control.python": '[control]\npython = "../mine.py:Mine"',
+    "$.signals.load.file": '[signals.load]\nfile = "../loads.csv"',
+    "$.component[0].fmu": '[[component]]\nname = "a"\nfmu = "/there/is/none.fmu"',
+    "$.plant.override[0].fmu": '[[plant.override]]\nagent = 1\nfmu = "../other.fmu"',
+}
+
+
+@pytest.mark.parametrize("place", OUTSIDE)
+def test_files_outside_the_folder_need_a_word(place: str, tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "loads.csv").write_text("time,a\n0,1\n")
+    path = scenario(folder, OUTSIDE[place])
+    with pytest.raises(
+        (InputError, ScenarioError), match="outside the scenario's folder"
+    ) as caught:
+        load(path)
+    assert place in str(caught.value)
+    load(path, outside=True)
+
+
+def test_a_link_does_not_lead_outside(tmp_path: Path) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "mine.py").write_text(MINE)
+    (folder / "link.py").symlink_to(tmp_path / "mine.py")
+    with pytest.raises((InputError, ScenarioError), match="outside the scenario's folder"):
+        load(scenario(folder, '[control]\npython = "link.py:Mine"'))
+
+
+def test_the_word_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "loads.csv").write_text("time,a\n0,1\n")
+    path = scenario(folder, '[signals.load]\nfile = "../loads.csv"')
+    assert main(["run", path, "--schedule"]) == 2
+    assert "--outside" in capsys.readouterr().err
+    assert main(["run", path, "--schedule", "--outside"]) == 0
