@@ -392,11 +392,11 @@ class VectorFunction:
         )
 
         def evaluate(*values: Any) -> Array:
-            shape = np.broadcast_shapes(*(np.shape(v) for v in values))
-            out = np.empty((*shape, len(self.expressions)))
+            # each component in one piece, seen with the components on the last axis
+            out = np.empty((len(self.expressions), *np.broadcast(*values).shape))
             for k, component in enumerate(code(*values)):
-                out[..., k] = component
-            return out
+                out[k] = component
+            return out if out.ndim == 1 else out.transpose(*range(1, out.ndim), 0)
 
         return evaluate
 

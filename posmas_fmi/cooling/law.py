@@ -396,6 +396,7 @@ class CoolingLaw(CompiledLaw):
         heard: Heard,
         memory: Array,
         weights: Weights,
+        leader: Array,
     ) -> Decision:
         """Return the inputs of all lines; see `LineControllers.step`."""
         disagreement = weights.disagreement(sent, heard)

@@ -61,6 +61,16 @@ class Conditions:
     loss: Array
     arc_off: Array
 
+    @property
+    def exact_sensors(self) -> bool:
+        """Whether every sensor shows what it measures."""
+        return bool((self.sensor_gain == 1.0).all() and not self.sensor_offset.any())
+
+    @property
+    def exact_actuators(self) -> bool:
+        """Whether every actuator does what it is told."""
+        return bool((self.actuator_gain == 1.0).all())
+
 
 @attrs.frozen(eq=False)
 class Timeline:
@@ -151,6 +161,8 @@ def rounded(value: Array, resolution: Array | float) -> Array:
     >>> rounded(np.array([1.26, 1.26]), np.array([0.5, 0.0]))
     array([1.5 , 1.26])
     """
+    if not np.any(resolution):
+        return value
     step = np.where(np.asarray(resolution) > 0, resolution, 1.0)
     return np.asarray(np.where(np.asarray(resolution) > 0, step * np.rint(value / step), value))
 

@@ -26,8 +26,10 @@ class Heard:
 
     Attributes
     ----------
-    messages : (arcs, w) array
-        Last message over each arc between agents.
+    pool : (k, w) array
+        Messages.
+    held : (arcs,) array of int
+        Which of them is the last one over each arc between agents.
     leader : (N, w) array
         Last message from the leader; zero where an agent is not pinned.
     silence : (N, 2) array
@@ -35,9 +37,15 @@ class Heard:
         leader [s].
     """
 
-    messages: Array
+    pool: Array
+    held: np.ndarray[tuple[int], np.dtype[np.int64]]
     leader: Array
     silence: Array
+
+    @property
+    def messages(self) -> Array:
+        """Last message over each arc between agents, (arcs, w)."""
+        return np.asarray(self.pool[self.held])
 
 
 @attrs.frozen(eq=False)
@@ -51,6 +59,7 @@ class Weights:
     ----------
     own, leader, own_innovation : (N,) array
     heard, heard_innovation : (N, arcs) sparse array
+        Of arcs, or of the pool of messages; see `through`.
     innovation : int
     """
 
@@ -74,18 +83,39 @@ class Weights:
         )
 
     def disagreement(self, sent: Array, heard: Heard) -> Array:
-        """Weighted disagreement of each agent with what it has heard, (N, w)."""
+        """Weighted disagreement of each agent with what it has heard, (N, w).
+
+        The weights must be those of the pool that `heard` has.
+        """
         first = sent.shape[1] - self.innovation
-        main = (
-            self.own[:, None] * sent[:, :first]
-            - self.heard @ heard.messages[:, :first]
-            - self.leader[:, None] * heard.leader[:, :first]
+        result = columns(*sent.shape)
+        main, rest = result[:, :first], result[:, first:]
+        np.multiply(self.own[:, None], sent[:, :first], out=main)
+        np.multiply(self.own_innovation[:, None], sent[:, first:], out=rest)
+        main -= self.heard @ heard.pool[:, :first]
+        main -= self.leader[:, None] * heard.leader[:, :first]
+        if self.heard_innovation.nnz:
+            rest -= self.heard_innovation @ heard.pool[:, first:]
+        return result
+
+    def through(self, held: Array, count: int) -> Weights:
+        """Return weights of a pool of messages instead of arcs.
+
+        Parameters
+        ----------
+        held : (arcs,) array of int
+            Which message each arc holds.
+        count : int
+            Messages in the pool.
+        """
+
+        def of_pool(by_arc: sp.csr_array) -> sp.csr_array:
+            entries = by_arc.data, held[by_arc.indices], by_arc.indptr
+            return sp.csr_array(entries, shape=(by_arc.shape[0], count))
+
+        return attrs.evolve(
+            self, heard=of_pool(self.heard), heard_innovation=of_pool(self.heard_innovation)
         )
-        rest = (
-            self.own_innovation[:, None] * sent[:, first:]
-            - self.heard_innovation @ heard.messages[:, first:]
-        )
-        return np.concatenate([main, rest], axis=1)
 
     def without(self, off: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Weights:
         """Leave arcs out of the digraph.
@@ -123,11 +153,19 @@ class Decision:
         What the controller takes it for: sec(u), or the limited input.
     memory : (N, k) array
         At the next communication point.
+    leader : (k,) array, optional
+        What the leader remembers there, where it was computed along with the others.
     """
 
     u: Array
     applied: Array
     memory: Array
+    leader: Array | None = None
+
+
+def columns(rows: int, width: int) -> Array:
+    """Room for an array whose columns stand in one piece: rows are many and short."""
+    return np.empty((width, rows)).T
 
 
 class Law(Interface):
@@ -161,8 +199,12 @@ class Law(Interface):
         heard: Heard,
         memory: Array,
         weights: Weights,
+        leader: Array,
     ) -> Decision:
-        """Return the inputs from t to t + h [s] and what is remembered there."""
+        """Return the inputs from t to t + h [s] and what is remembered there.
+
+        `leader` is what the leader remembers; its next may be returned as well.
+        """
 
     def leader_message(self, memory: Array) -> Array:
         """Return what the leader sends, (w,)."""
@@ -261,7 +303,11 @@ class ProtocolLaw(CompiledLaw):
 
     def send(self, memory: Array, measured: Array) -> Array:
         """Return the estimate and the innovation ``y - C x̂`` of each agent, (N, m + q)."""
-        return np.concatenate([memory, measured - memory @ self.agent.C.T], axis=1)
+        agent = self.agent
+        sent = columns(len(memory), agent.m + agent.q)
+        sent[:, : agent.m] = memory
+        np.subtract(measured, (agent.C @ memory.T).T, out=sent[:, agent.m :])
+        return sent
 
     def step(
         self,
@@ -272,14 +318,19 @@ class ProtocolLaw(CompiledLaw):
         heard: Heard,
         memory: Array,
         weights: Weights,
+        leader: Array,
     ) -> Decision:
-        """Equation (6), and the observer over one communication step."""
-        m = self.agent.m
+        """Equation (6), and the observer over one communication step; the leader runs free."""
+        agent, N, m = self.agent, len(memory), self.agent.m
         disagreement = weights.disagreement(sent, heard)
-        u = disagreement[:, :m] @ self.protocol.K.T
+        u = (self.protocol.K @ disagreement[:, :m].T).T
         applied = self.agent.sec_numpy(u)
-        held = applied @ self.agent.B.T + disagreement[:, m:] @ self.protocol.E.T
-        return Decision(u, applied, self.propagator(h)(t, memory, held))
+        states, held = columns(N + 1, m), columns(N + 1, m)
+        states[:N], states[N] = memory, leader
+        held[:N] = (agent.B @ applied.T + self.protocol.E @ disagreement[:, m:].T).T
+        held[N] = 0.0
+        after = self.propagator(h)(t, states, held)
+        return Decision(u, applied, after[:N], after[N])
 
     def leader_message(self, memory: Array) -> Array:
         """Return the state, and no innovation."""

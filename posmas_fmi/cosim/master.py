@@ -285,17 +285,29 @@ class Run:
         self.system, self.plant = system, plant
         self.record, self.progress = record, progress
         network, agent, law = system.network, system.agent, system.law
+        N = network.N
+        # what stays the same is worked out here, once
         self.pinned = np.array(network.pinned, dtype=int)
         self.arcs = network.adjacency.nnz
+        self.receivers = np.repeat(np.arange(N), np.diff(network.adjacency.indptr))
         self.timeline = system.timeline
+        self.jumps = dict(reversed(system.leader_changes))
+        self.change = 0  # the communication point at which conditions change next
         self.always_draws = self.timeline.has("loss")
-        at, N = plant.reading_at[: network.N, None], network.N
-        self.y_at = at + np.arange(agent.q)
-        self.x_at = at + agent.q + np.arange(agent.m) if plant.shows_states else None
+        self.at_once = system.channel.ideal and not self.always_draws  # messages arrive
+        self.held: Any = system.senders if self.at_once else np.arange(self.arcs)
+        readings_at = plant.reading_at[: N + 1]
+        self.y_of = _taker(readings_at, 0, agent.q)
+        self.x_of = _taker(readings_at, agent.q, agent.m) if plant.shows_states else None
         self.u_at = plant.input_at[:N, None] + np.arange(agent.p)
         is_u = np.zeros(plant.input_at[-1], dtype=bool)
         is_u[self.u_at] = True
         self.extra_at = np.flatnonzero(~is_u)
+        self.lengths = system.every * system.clock.period / TICKS_PER_SECOND  # of the steps [s]
+        self.in_step = bool((system.every == 1).all())  # every period is one communication step
+        of_agents = system.every[:N]
+        self.periods = [(int(period), of_agents == period) for period in np.unique(of_agents)]
+        self.recorded = np.array(system.wiring.recorded, dtype=np.int64)
         memory = law.start(system.xhat0)
         leader = law.lead(system.s0)
         width = len(law.leader_message(leader))
@@ -316,11 +328,13 @@ class Run:
         )
         self.drive = np.zeros(0)  # the exogenous signals at k
         self.conditions = self.timeline.at(0)
-        self.weights = law.weights
+        self.exact_sensors = self.exact_actuators = True
+        self.weights = self._weights()
+        self.leads: Array | None = None  # what the leader remembers next, where it is known
         self.largest_initial = 0.0
         self.min_state = np.full(N, np.inf)
         self.min_time = np.zeros(N)
-        self.tracking = self.estimation = np.zeros(N)
+        self.seen: tuple[Array, Array, Array] | None = None  # x, the estimates and s
         self.limit = np.inf
         self.replay_noise = 0.0  # of a reading, relative to its size or 1
 
@@ -341,13 +355,14 @@ class Run:
             ended, reason, agent = "failed", str(error), error.agent
         except KeyboardInterrupt:
             ended, reason = "cancelled", "interrupted"
-        state = self.state
+        state, zero = self.state, np.zeros(self.system.network.N)
+        tracking, estimation = (zero, zero) if self.seen is None else errors_at(*self.seen)
         return Outcome(
             ended=ended,
             steps=state.k,
             time=self.system.clock.time(state.k),
-            tracking_error=self.tracking,
-            estimation_error=self.estimation,
+            tracking_error=tracking,
+            estimation_error=estimation,
             largest_initial=self.largest_initial,
             min_state=self.min_state,
             min_time=self.min_time,
@@ -376,81 +391,105 @@ class Run:
             self._step(k)
             self._remember(t, k)
             state.k = k + 1
-            begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
+            begins = everyone
+            if not self._all_act:
+                begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
             self.plant.checkpoint()
             interrupt.check()
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
 
+    @property
+    def _all_act(self) -> bool:
+        """Whether every instance takes every communication step."""
+        return self.in_step and not self.plant.frozen.any()
+
     def _change_conditions(self, k: int) -> None:
         system, state = self.system, self.state
-        self.drive = system.wiring.drive.rows(k, k + 1)[0]
-        if k == 0 or self.timeline.next_change(k - 1) == k:
+        if system.wiring.drive.columns:
+            self.drive = system.wiring.drive.rows(k, k + 1)[0]
+        if k == self.change:
             self.conditions = self.timeline.at(k)
-            self.weights = system.weights_with(self.conditions.arc_off)
-        jump = system.leader_at(k)
-        if jump is not None:
-            state.leader = system.law.lead(jump)
+            self.exact_sensors = self.conditions.exact_sensors
+            self.exact_actuators = self.conditions.exact_actuators
+            self.weights = self._weights()
+            self.change = self.timeline.next_change(k)
+        if k in self.jumps:
+            state.leader = system.law.lead(self.jumps[k])
+
+    def _weights(self) -> Weights:
+        weights = self.system.weights_with(self.conditions.arc_off)
+        if self.at_once:
+            return weights.through(self.held, self.system.network.N)
+        return weights
 
     def _measure(self, k: int, begins: Whole) -> None:
         """Measure y, then the rest, through the sensors."""
         system, state, sensors = self.system, self.state, self.system.sensors
-        y = state.readings[self.y_at]
-        rest = system.wiring.take(system.wiring.measured, state.readings, self.drive)
-        value = np.concatenate([y, rest], axis=1) + self.conditions.sensor_offset
+        value = self.y_of(state.readings)
+        if system.law.extras:
+            rest = system.wiring.take(system.wiring.measured, state.readings, self.drive)
+            value = np.concatenate([value, rest], axis=1)
+        if not self.exact_sensors:
+            value = value + self.conditions.sensor_offset
         if sensors is not None:
             value = value + sensors.noise_at(k, k + 1, system.seed)[0]
             value = rounded(value, sensors.resolution)
-        if k > 0:
+        if k > 0 and not self.exact_sensors:
             gain = self.conditions.sensor_gain
             follows = state.measured + gain * (value - state.measured)
             value = np.where(gain == 1.0, value, follows)
+        if len(begins) == system.instances:
+            state.measured = value
+            return
         agents = begins[begins < system.network.N]
         state.measured = state.measured.copy()
         state.measured[agents] = value[agents]
 
     def _exchange(self, k: int, sent: Array) -> Heard:
         """Send over every arc and from the leader to the pinned; return what is now held."""
-        state, N = self.state, self.system.network.N
+        state, N, width = self.state, self.system.network.N, sent.shape[1]
         law, mailbox = self.system.law, self.state.mailbox
-        from_leader = np.broadcast_to(
-            law.leader_message(state.leader), (len(self.pinned), sent.shape[1])
+        from_leader = law.leader_message(state.leader)
+        leader, silence = np.zeros((width, N)).T, np.zeros((N, 2))
+        if self.at_once:
+            mailbox.sent += self.arcs + len(self.pinned)
+            leader[self.pinned] = from_leader
+            return Heard(sent, self.held, leader, silence)
+        message = np.concatenate(
+            [sent[self.system.senders], np.tile(from_leader, (len(self.pinned), 1))]
         )
-        message = np.concatenate([sent[self.system.senders], from_leader])
         if k == 0:
             mailbox.held = message
         received = mailbox.exchange(k, message, self.conditions.loss if self.always_draws else None)
-        leader = np.zeros((N, sent.shape[1]))
         leader[self.pinned] = received[self.arcs :]
         age = mailbox.age(k) * self.system.clock.period / TICKS_PER_SECOND
-        silence = np.zeros((N, 2))
-        np.maximum.at(silence[:, 0], self._receivers, age[: self.arcs])
+        np.maximum.at(silence[:, 0], self.receivers, age[: self.arcs])
         silence[self.pinned, 1] = age[self.arcs :]
-        return Heard(received[: self.arcs], leader, silence)
-
-    @property
-    def _receivers(self) -> Any:
-        starts = self.system.network.adjacency.indptr
-        return np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        return Heard(received[: self.arcs], self.held, leader, silence)
 
     def _control(self, t: float, k: int, sent: Array, heard: Heard) -> None:
         """Let the controllers decide whose period begins; the others' inputs stay."""
-        system, state, every = self.system, self.state, self.system.every[: len(sent)]
-        state.u, state.applied = state.u.copy(), state.applied.copy()
-        for period in np.unique(every):
-            mine = (every == period) & (k % period == 0) & ~self.plant.frozen[: len(every)]
-            if not mine.any():
+        system, state, all_act = self.system, self.state, self._all_act
+        for period, of_period in self.periods:
+            mine = of_period if all_act else of_period & ~self.plant.frozen[: len(sent)]
+            if k % period or not mine.any():
                 continue
-            h = int(period) * system.clock.period / TICKS_PER_SECOND
+            h = period * system.clock.period / TICKS_PER_SECOND
             decision = system.law.step(
-                t, h, state.measured, sent, heard, state.memory, self.weights
+                t, h, state.measured, sent, heard, state.memory, self.weights, state.leader
             )
-            state.u[mine], state.applied[mine] = decision.u[mine], decision.applied[mine]
-            state.pending[mine] = decision.memory[mine]
-            gain = np.ones_like(decision.u) if k == 0 else self.conditions.actuator_gain
-            follows = state.actuated + gain * (decision.u - state.actuated)
-            actuated = np.where(gain == 1.0, decision.u, follows)
-            state.actuated = np.where(mine[:, None], actuated, state.actuated)
+            if period == 1:
+                self.leads = decision.leader
+            actuated = decision.u
+            if k > 0 and not self.exact_actuators:
+                gain = self.conditions.actuator_gain
+                follows = state.actuated + gain * (decision.u - state.actuated)
+                actuated = np.where(gain == 1.0, decision.u, follows)
+            state.u = _merged(mine, decision.u, state.u)
+            state.applied = _merged(mine, decision.applied, state.applied)
+            state.pending = _merged(mine, decision.memory, state.pending)
+            state.actuated = _merged(mine, actuated, state.actuated)
 
     def _step(self, k: int) -> None:
         """Set the inputs of the instances whose step begins; step those whose step ends."""
@@ -495,23 +534,28 @@ class Run:
         """Step stage after stage; inputs are made of `latest`, which is brought up to date."""
         system, state, clock = self.system, self.state, self.system.clock
         for stage in system.stages:
-            alive = stage[~self.plant.frozen[stage]]
-            begins = alive[k % system.every[alive] == 0]
+            begins = ends = stage
+            if not self._all_act:
+                alive = stage[~self.plant.frozen[stage]]
+                begins = alive[k % system.every[alive] == 0]
+                ends = alive[(k + 1) % system.every[alive] == 0]
             self._set_inputs(begins, latest)
-            ends = alive[(k + 1) % system.every[alive] == 0]
             if not len(ends):
                 continue
-            every = system.every[ends]
-            t = (k + 1 - every) * clock.period / TICKS_PER_SECOND
-            h = every * clock.period / TICKS_PER_SECOND
-            self.plant.step(ends, t, h, state.inputs, latest)
+            t = (k + 1 - system.every[ends]) * clock.period / TICKS_PER_SECOND
+            self.plant.step(ends, t, self.lengths[ends], state.inputs, latest)
             state.k = k + 1  # a reading that fails belongs to the next point
-            self.plant.read(ends[~self.plant.frozen[ends]], clock.time(k + 1), latest)
+            if not self._all_act:
+                ends = ends[~self.plant.frozen[ends]]  # some may have failed in this very step
+            self.plant.read(ends, clock.time(k + 1), latest)
             state.k = k
         return latest
 
     def _set_inputs(self, which: Whole, readings: Array) -> None:
         state, at = self.state, self.plant.input_at
+        if not len(self.extra_at) and len(which) == len(at) - 1:
+            state.inputs = np.ascontiguousarray(state.actuated).ravel()
+            return
         values = np.empty(at[-1])
         values[self.u_at] = state.actuated
         values[self.extra_at] = self.system.wiring.inputs(readings, self.drive)
@@ -522,38 +566,42 @@ class Run:
 
     def _remember(self, t: float, k: int) -> None:
         state, system = self.state, self.system
-        N = system.network.N
-        ends = ((k + 1) % system.every[:N] == 0) & ~self.plant.frozen[:N]
-        state.memory = np.where(ends[:, None], state.pending, state.memory)
-        state.leader = system.law.leader_step(t, system.clock.h, state.leader)
+        if self._all_act:
+            state.memory = state.pending
+        else:
+            N = system.network.N
+            ends = ((k + 1) % system.every[:N] == 0) & ~self.plant.frozen[:N]
+            state.memory = _merged(ends, state.pending, state.memory)
+        if self.leads is None:
+            self.leads = system.law.leader_step(t, system.clock.h, state.leader)
+        state.leader, self.leads = self.leads, None
 
     def _observe(self, t: float) -> None:
         """Record, and keep the figures of the outcome."""
         state, m = self.state, self.system.agent.m
-        x = None if self.x_at is None else state.readings[self.x_at]
+        x = None if self.x_of is None else self.x_of(state.readings)
         xhat, s = state.memory[:, :m], state.leader[:m]
         if self.record is not None:
-            y = state.readings[self.y_at]
+            y = self.y_of(state.readings)
             row = {"xhat": xhat, "u": state.u, "sec_u": state.applied, "y": y, "s": s}
             if x is not None:
                 row["x"] = x
             row["measured"] = state.measured
-            recorded = np.array(self.system.wiring.recorded, dtype=np.int64)
-            row["extra"] = self.system.wiring.take(recorded, state.readings, self.drive)
+            row["extra"] = self.system.wiring.take(self.recorded, state.readings, self.drive)
             self.record(t, row)
         truth = xhat if x is None else x
-        self.tracking, self.estimation = errors_at(truth, xhat, s)
+        self.seen = truth, xhat, s
         if state.k == 0:
-            self.largest_initial = float(self.tracking.max())
+            self.largest_initial = float(np.abs(truth - s).max())
             scale = max(np.abs(truth).max(), np.abs(s).max(), np.abs(xhat).max(), 1.0)
             self.limit = DIVERGED * float(scale)
         lowest = reduce(np.minimum, truth.T)
         falls = lowest < self.min_state
-        self.min_state = np.where(falls, lowest, self.min_state)
-        self.min_time = np.where(falls, t, self.min_time)
-        size = np.maximum(_largest(truth), _largest(xhat))
-        if not (size <= self.limit).all():
-            self._diverged(t, size)
+        if falls.any():
+            self.min_state = np.where(falls, lowest, self.min_state)
+            self.min_time = np.where(falls, t, self.min_time)
+        if not (_size(truth) <= self.limit and _size(xhat) <= self.limit):
+            self._diverged(t, np.maximum(_largest(truth), _largest(xhat)))
 
     def _diverged(self, t: float, size: Array) -> NoReturn:
         name, reason = diverged_reason(self.system.network.names, size, self.limit, t)
@@ -574,6 +622,31 @@ def _change(a: Array, b: Array) -> float:
 def _largest(X: Array) -> Array:
     """Largest modulus in each row, (N,); column by column, for rows are short and many."""
     return np.asarray(reduce(np.maximum, np.abs(X).T))
+
+
+def _size(X: Array) -> float:
+    """Largest modulus; NaN or infinite where one of the numbers is."""
+    return max(float(X.max()), -float(X.min()))
+
+
+def _merged(chosen: Any, new: Array, old: Array) -> Array:
+    """Rows of the new array where they are chosen, else of the old one."""
+    return new if chosen.all() else np.where(chosen[:, None], new, old)
+
+
+def _taker(starts: Whole, first: int, count: int) -> Callable[[Array], Array]:
+    """Return a function that takes some values of each agent, (N, count), from those of all.
+
+    Agents with equally many values are the rows of a matrix. What it gives has columns in one
+    piece: rows are many and short, so all that follows is done column by column.
+    """
+    widths = np.diff(starts)
+    N, width = len(widths), int(widths[0])
+    if (widths == width).all() and starts[0] == 0:
+        some = slice(first, first + count)
+        return lambda values: np.asfortranarray(values[: N * width].reshape(N, width)[:, some])
+    places = starts[:-1, None] + first + np.arange(count)
+    return lambda values: np.asfortranarray(values[places])
 
 
 def diverged_reason(names: Sequence[str], size: Array, limit: float, t: float) -> tuple[str, str]:

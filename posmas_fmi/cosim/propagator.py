@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import attrs
 import numpy as np
@@ -12,7 +13,7 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.expression import Array
 
 
-@attrs.frozen(eq=False)
+@attrs.frozen(eq=False, slots=False)
 class Propagator:
     """One communication step of ``x' = A x + H g(t, x) + w`` for many agents at once.
 
@@ -64,23 +65,34 @@ class Propagator:
             end=h * (4.0 * phi3 - phi2),
         )
 
+    @cached_property
+    def stages(self) -> tuple[Array, Array, Array, Array]:
+        """Matrices of the stages a, b, c and of the end, (m, 3m) to (m, 6m).
+
+        Each is a linear combination of the columns of x, w and of g at x, a, b and c.
+        """
+        A, G, zero = self.half, self.half_gamma, np.zeros_like(self.half)
+        GH, base = G @ self.H, [A, G]
+        a = np.hstack([*base, GH])
+        b = np.hstack([*base, zero, GH])
+        # A a + G (2 H g(b) - H g(x) + w)
+        c = np.hstack([A @ A, A @ G + G, A @ GH - GH, zero, 2.0 * GH])
+        of_g = [part @ self.H for part in (self.start, self.middle, self.middle, self.end)]
+        return a, b, c, np.hstack([self.full, self.gamma, *of_g])
+
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""
         # columns are agents here: products of a small matrix and a wide one are the fast ones
-        x, w, h = X.T, W.T, self.h
-        ga = self._weighted(t, x)
-        base = self.half @ x + self.half_gamma @ w
-        a = base + self.half_gamma @ ga
-        gb = self._weighted(t + 0.5 * h, a)
-        gc = self._weighted(t + 0.5 * h, base + self.half_gamma @ gb)
-        c = self.half @ a + self.half_gamma @ (2.0 * gc - ga + w)
-        gd = self._weighted(t + h, c)
-        linear = self.full @ x + self.gamma @ w
-        end = linear + self.start @ ga + self.middle @ (gb + gc) + self.end @ gd
-        return np.ascontiguousarray(end.T)
-
-    def _weighted(self, t: float, x: Array) -> Array:
-        return np.asarray(self.H @ self.g(t, x.T).T)
+        N, m = X.shape
+        known = np.empty((6 * m, N))  # x, w, then g of each stage
+        known[:m], known[m : 2 * m] = X.T, W.T
+        x, half = X.T, 0.5 * self.h
+        for k, (time, stage) in enumerate(
+            zip((t, t + half, t + half, t + self.h), self.stages, strict=True), start=2
+        ):
+            known[k * m : (k + 1) * m] = self.g(time, x.T).T
+            x = stage @ known[: (k + 1) * m]
+        return np.asarray(x.T)
 
 
 def _phi_functions(M: Array) -> tuple[Array, Array, Array, Array]:

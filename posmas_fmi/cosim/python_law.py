@@ -136,6 +136,7 @@ class PythonLaw:
         heard: Heard,
         memory: Array,
         weights: Weights,
+        leader: Array,
     ) -> Decision:
         """Ask every controller.
 
@@ -144,7 +145,7 @@ class PythonLaw:
         InputError
             If an answer has another size than the agent's input, or is not finite.
         """
-        w = self._width
+        w, messages = self._width, heard.messages
         if self._central is not None:
             s = heard.leader[min(self._pinned)][w:] if self._pinned else None
             u = self._checked(self._central.step_all(t, measured, s), measured.shape[0], "step_all")
@@ -155,7 +156,7 @@ class PythonLaw:
                         one.step(
                             t,
                             measured[i],
-                            heard.messages[self._arcs_of[i]][:, :w],
+                            messages[self._arcs_of[i], :w],
                             heard.leader[i][w:] if i in self._pinned else None,
                         ),
                         1,
@@ -169,7 +170,7 @@ class PythonLaw:
 
     def _checked(self, answer: Any, rows: int, what: str) -> Array:
         try:
-            u = np.asarray(answer, dtype=float).reshape(rows, self._agent.p)
+            u = np.array(answer, dtype=float).reshape(rows, self._agent.p)
         except (TypeError, ValueError):
             raise InputError(
                 f"{what}: expected {rows * self._agent.p} numbers (got {answer!r})",
