@@ -129,3 +129,10 @@ def test_the_trial_ends_with_the_report(tank: Path) -> None:
     assert "period to use   2 s" in text
     assert "[plant.inputs]" in text
     assert text.splitlines()[-1].startswith("fine")
+
+
+def test_a_way_that_an_fmu_refuses_is_no_error_of_the_fmu() -> None:
+    """Only the report sets inputs more than 150 times in one process."""
+    made = check_fmu(hostile.path("Set error 150"), ["u"], ["y"])
+    assert made.exit_code == 0, [str(f) for f in made.findings]
+    assert [(f.severity, f.code) for f in made.findings] == [("note", "status-error")]

@@ -89,7 +89,7 @@ class Trial:
                 PHASES[name](self)
             except FmuCallError as error:
                 if not journal.told():
-                    self._failed(error.message)
+                    self._failed(error.message, error.where.rpartition(": ")[2])
             except ArchiveError as error:
                 journal.note(journal.severity, "not-loaded", "load", error.message[:500])
             except PosmasError as error:
@@ -99,9 +99,10 @@ class Trial:
             if board.vital:  # it did not come to its first step
                 break
 
-    def _failed(self, text: str) -> None:
+    def _failed(self, text: str, call: str = "") -> None:
         journal = self.journal
         board = journal.board
+        severity = journal.severity
         if board.phase == "control":
             journal.note("note", "no-control-report", board.call, text[:500])
             return
@@ -111,11 +112,12 @@ class Trial:
             code = "not-loaded"
         elif "asked to end" in text:
             code = "terminates"
+            severity = "fatal" if board.vital else "warning"
         elif "returned early" in text:
             code = "stuck"
         else:
             code = f"{board.phase}-failed"
-        journal.note(journal.severity, code, board.call or board.phase, text[:500])
+        journal.note(severity, code, call or board.call or board.phase, text[:500])
 
     # ---- instances ------------------------------------------------------------------------------
 
@@ -185,7 +187,7 @@ class Trial:
                 self.journal.note(
                     "error", "not-finite", name, f"its value is {value} at {instance.time:g} s"
                 )
-            elif abs(value) > _ABSURD:
+            elif abs(value) > _ABSURD and self.journal.board.phase == "life":
                 self.journal.note("warning", "absurd", name, f"its value is {value:g}")
         return values
 
