@@ -155,3 +155,47 @@ def test_bad_files_of_signals_name_the_line(name: str, folder: Path) -> None:
 def test_a_missing_file_of_a_signal(folder: Path) -> None:
     with pytest.raises((InputError, ScenarioError), match=r"no file 'other\.csv'"):
         load(write(folder, ('file = "loads.csv"', 'file = "other.csv"')))
+
+
+def netcdf(folder: Path, **changes: object) -> None:
+    import xarray
+
+    given = {
+        "load": (("time", "agent"), np.array([[80.0, 70.0, 90.0], [100.0, 70.0, 60.0]])),
+        "other": (("time",), np.array([1.0, 2.0])),
+        "time": ("time", np.array([0.0, 22.0]), {"units": "s"}),
+    } | changes
+    xarray.Dataset(given).to_netcdf(folder / "loads.nc", engine="h5netcdf")
+
+
+NC = (('file = "loads.csv"', 'file = "loads.nc"\ncolumns = ["load"]'),)
+
+
+def test_signals_from_netcdf(folder: Path) -> None:
+    netcdf(folder)
+    of_csv, of_netcdf = (load(write(folder, *change)).signals for change in ((), NC))
+    assert of_csv is not None
+    assert of_netcdf is not None
+    np.testing.assert_array_equal(of_csv.rows(0, 12), of_netcdf.rows(0, 12))
+
+
+BAD_NETCDF = {
+    "gap": ({"load": (("time", "agent"), np.array([[1.0, 2.0, 3.0], [1.0, np.nan, 3.0]]))}, "gap"),
+    "unit": ({"time": ("time", np.array([0.0, 1.0]), {"units": "h"})}, "time in s"),
+    "order": ({"time": ("time", np.array([1.0, 0.0]), {"units": "s"})}, "increasing times"),
+    "columns": ({"load": (("time", "agent"), np.ones((2, 2)))}, "one for each agent"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_NETCDF)
+def test_netcdf_that_is_no_signal(name: str, folder: Path) -> None:
+    changes, message = BAD_NETCDF[name]
+    netcdf(folder, **changes)
+    with pytest.raises((InputError, ScenarioError), match=message):
+        load(write(folder, *NC))
+
+
+def test_what_is_no_netcdf(folder: Path) -> None:
+    (folder / "loads.nc").write_bytes(b"nonsense")
+    with pytest.raises((InputError, ScenarioError), match="cannot be read as NetCDF-4"):
+        load(write(folder, *NC))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
@@ -14,6 +15,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.scenario.tables import Generated, SignalTable
 
 LARGEST_FILE = 1_000_000_000  # bytes
+NETCDF = (".nc", ".nc4", ".cdf")
 
 
 @attrs.frozen(eq=False)
@@ -132,8 +134,9 @@ def read_signal(
     if table.value is not None:
         return Signal(np.zeros(1), np.full((1, 1), table.scale * table.value + table.offset))
     path = folder / str(table.file)
-    header, rows = _read(path, place)
-    wanted = table.columns or header[1:]
+    netcdf = path.suffix.lower() in NETCDF
+    header, rows = _read_netcdf(path, place) if netcdf else _read(path, place)
+    wanted = _wanted(table.columns, header)
     missing = [column for column in wanted if column not in header]
     if missing:
         raise InputError(
@@ -148,13 +151,27 @@ def read_signal(
     time = rows[:, 0]
     late = np.flatnonzero(np.diff(time) <= 0)
     if late.size:
+        where = f"entry {late[0] + 2}" if netcdf else f"line {late[0] + 3}"
         raise InputError(
-            f"{path.name}, line {late[0] + 3}: expected increasing times (got "
+            f"{path.name}, {where}: expected increasing times (got "
             f"{time[late[0] + 1]:g} s after {time[late[0]]:g} s)",
             f"{place}.file",
         )
     values = rows[:, [header.index(column) for column in wanted]]
+    gaps = np.argwhere(~np.isfinite(values))
+    if len(gaps) or not np.isfinite(time).all():
+        where = f"entry {gaps[0][0] + 1}: {wanted[gaps[0][1]]}" if len(gaps) else "time"
+        raise InputError(f"{path.name}, {where} is not finite; fill the gap", f"{place}.file")
     return Signal(time, table.scale * values + table.offset, table.interpolation == "linear")
+
+
+def _wanted(columns: list[str], header: list[str]) -> list[str]:
+    """Columns that are asked for; the name of a variable with several columns stands for all."""
+    found: list[str] = []
+    for column in columns or header[1:]:
+        several = [name for name in header if name.startswith(f"{column}[")]
+        found += several if column not in header and several else [column]
+    return found
 
 
 def _scaled(signal: Signal, table: SignalTable) -> Signal:
@@ -192,6 +209,45 @@ def _generate(table: Generated, agents: int, until: float, period: float, seed: 
         step = 15.0 if table.step is None else table.step
         loads = generate_loads(agents, max(until, step), seed, table.maximum, step)
     return Signal(loads.time, loads.power)
+
+
+def _read_netcdf(path: Path, place: str) -> tuple[list[str], Array]:
+    """Names and numbers of the variables over ``time`` of a NetCDF-4 file, as of a CSV file.
+
+    A variable over time and another dimension gives the columns ``name[1]``, ``name[2]``, …
+    """
+    import h5netcdf
+
+    where = f"{place}.file"
+    if not path.is_file():
+        raise InputError(f"there is no file {path.name!r} beside the scenario", where)
+    try:
+        with h5netcdf.File(path, "r") as file:
+            if "time" not in file.variables or file["time"].dimensions != ("time",):
+                raise InputError(f"{path.name}: expected a variable time over time [s]", where)
+            _check_seconds(file["time"], path, where)
+            header, columns = ["time"], [np.asarray(file["time"][...], dtype=float)[:, None]]
+            for name, variable in file.variables.items():
+                numeric = variable.dtype is not str and np.dtype(variable.dtype).kind in "fiu"
+                if name == "time" or not numeric or variable.dimensions[:1] != ("time",):
+                    continue
+                if len(variable.dimensions) > 2:
+                    continue
+                values = np.asarray(variable[...], dtype=float).reshape(len(columns[0]), -1)
+                one = len(variable.dimensions) == 1
+                header += [name] if one else [f"{name}[{k + 1}]" for k in range(values.shape[1])]
+                columns.append(values)
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path.name} cannot be read as NetCDF-4: {error}", where) from None
+    if len(header) < 2 or not len(columns[0]):
+        raise InputError(f"{path.name}: expected a variable over time beside time", where)
+    return header, np.concatenate(columns, axis=1)
+
+
+def _check_seconds(time: Any, path: Path, where: str) -> None:
+    unit = time.attrs.get("units", "s")
+    if unit not in ("s", "sec", "second", "seconds"):
+        raise InputError(f"{path.name}: expected time in s (got {unit!r})", where)
 
 
 def _read(path: Path, place: str) -> tuple[list[str], Array]:

@@ -287,7 +287,8 @@ class SignalTable:
     generated : table, optional
         Instead of `file`: heat loads, see `Generated`.
     file : str, optional
-        CSV with a header and the time [s] in its first column.
+        CSV with a header and the time [s] in its first column; or NetCDF-4 (``.nc``), where the
+        variables over ``time`` are the columns.
     columns : list of str
         Which columns; one, or one for each agent. Default: all but the time.
     scale, offset : float
