@@ -20,7 +20,11 @@ import attrs
 DOCS = Path(__file__).resolve().parent
 NOTEBOOKS = DOCS.parent / "notebooks"
 PAGES = DOCS / "notebooks"
-NOTE = """<!-- Made by docs/render.py from notebooks/{name}.py: edit that, then run the script. -->
+NOTE = """---
+hide: [toc]
+---
+
+<!-- Made by docs/render.py from notebooks/{name}.py: edit that, then run the script. -->
 
 !!! note ""
     This page is the notebook `notebooks/{name}.py`, executed. To run it yourself, open it in

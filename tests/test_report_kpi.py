@@ -12,7 +12,7 @@ from kpi_runs import comparison
 from posmas_fmi.errors import InputError
 from posmas_fmi.report import write_report
 from posmas_fmi.report.kpi_data import read_kpis
-from posmas_fmi.report.kpi_wording import headline
+from posmas_fmi.report.kpi_wording import advice, headline
 
 
 @pytest.fixture(scope="module")
@@ -165,3 +165,19 @@ def test_values_that_are_not_finite_are_not_known_and_not_coloured(tmp_path):
 
     codes = base64.b64decode(data["controllers"]["pi"])
     assert codes[-4:-2] == b"\xff\xff"  # line 2 of 3 at the end, "not known"
+
+
+def test_of_many_lines_the_page_says_whose_cycles_it_counts(page, tmp_path):
+    assert "A dot for each of" not in page
+    text = write_report(comparison(tmp_path, n=70, step=120.0)).read_text(encoding="utf-8")
+    assert "A dot for each of 64 of the 70 lines, evenly chosen, a bar at their mean." in text
+
+
+def test_the_advice_tells_what_the_better_one_is_worse_at(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "run")
+    figures = json.loads((folder / "summary.json").read_text())["comparison"]
+    figures["integral"]["rms_K"] = 2 * figures["pi"]["rms_K"]
+    edit(tmp_path / "run", comparison=figures)
+    found = read_kpis(tmp_path / "run")
+    assert found.best.name == "integral"
+    assert "rms deviation is larger" in advice(found).lower()

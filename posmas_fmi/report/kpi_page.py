@@ -211,7 +211,7 @@ def _worst_row(controller: Controller) -> tuple[str, str, str, str, str]:
 
 
 def _wear(drawn: list[Controller]) -> list[Panel]:
-    from posmas_fmi.report.kpi_wear import cycles_per_hour, strokes_per_hour
+    from posmas_fmi.report.kpi_wear import MOST_LINES, cycles_per_hour, strokes_per_hour
 
     panels = []
     for key, title, label, of in (
@@ -227,7 +227,11 @@ def _wear(drawn: list[Controller]) -> list[Panel]:
             means = ", ".join(f"{name} {show(float(np.nanmean(row)))}" for name, row in values)
             alt = f"{title}, {label}, mean over the lines: {means}."
             plot = _safe(kpi_figures.wear_panel(values, label, f"wear-{key}", alt))
-            panels.append(Panel(title, "A dot per line, a bar at their mean.", plot))
+            lines = max(c.signals.N for c in drawn if c.signals is not None)
+            dots = "A dot per line"
+            if key == "case" and lines > MOST_LINES:
+                dots = f"A dot for each of {MOST_LINES} of the {lines} lines, evenly chosen"
+            panels.append(Panel(title, f"{dots}, a bar at their mean.", plot))
     return panels
 
 

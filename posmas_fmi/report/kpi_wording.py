@@ -68,6 +68,7 @@ def advice(run: KpiRun) -> str:
     parts = []
     if practice is not None and best is not practice:
         for key, more, less in (
+            ("rms_K", "its RMS deviation is larger", "its RMS deviation is smaller"),
             ("valve_strokes_per_h", "its valves travel more", "its valves travel less"),
             ("spread_K", "the lines differ more", "the lines differ less"),
         ):
