@@ -125,9 +125,9 @@ def _certify(arguments: argparse.Namespace) -> int:
     from posmas_fmi.scenario.job import pinned_network
 
     scenario = load(arguments.scenario, outside=arguments.outside)
-    K, E = _read_gains(arguments.gains)
+    K, E, K_q = _read_gains(arguments.gains)
     network, _ = pinned_network(scenario)
-    made = certify(scenario.agent, network, K, E, scenario.design, scenario.clock.h)
+    made = certify(scenario.agent, network, K, E, scenario.design, scenario.clock.h, K_q)
     return _show_design(made, arguments.json)
 
 
@@ -261,6 +261,8 @@ def _show_design(made: Design, as_json: bool) -> int:
         print(f"pinned        {', '.join(made.pinned)}")
         print(f"K             {made.K.tolist()}")
         print(f"E             {made.E.tolist()}")
+        if made.K_q is not None:
+            print(f"K_q           {made.K_q.tolist()} of {', '.join(made.integrates)}")
         print(f"certified     {_certified(made)}")
         print(f"rate          {_number(certificate.rate)} 1/s")
         print(f"observer      {_number(certificate.observer_rate)} 1/s")
@@ -377,8 +379,8 @@ def _progress(label: str) -> Progress | None:
 # ---- input --------------------------------------------------------------------------------------
 
 
-def _read_gains(path: Path) -> tuple[Any, Any]:
-    """Read K and E from a JSON file, also from a design.json."""
+def _read_gains(path: Path) -> tuple[Any, Any, Any]:
+    """Read K, E and K_q, where there is one, from a JSON file, also from a design.json."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -388,7 +390,7 @@ def _read_gains(path: Path) -> tuple[Any, Any]:
     missing = [k for k in ("K", "E") if not isinstance(content, dict) or k not in content]
     if missing:
         raise InputError(f"the key {missing[0]} is missing", str(path))
-    return content["K"], content["E"]
+    return content["K"], content["E"], content.get("K_q")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -431,7 +433,7 @@ def _parser() -> argparse.ArgumentParser:
     design.add_argument("--outside", action="store_true", help=outside)
     design.add_argument(
         "--method",
-        choices=("contraction", "lmi", "paper-1", "paper-2"),
+        choices=("contraction", "lmi", "integral", "paper-1", "paper-2"),
         help="in place of the scenario's",
     )
     design.add_argument("--json", action="store_true", help="print gains and certificate as JSON")

@@ -1,11 +1,21 @@
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
+import attrs
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
-from posmas_fmi.agent import linear_agent
+from posmas_fmi.agent import Agent, linear_agent
+from posmas_fmi.cli import main
+from posmas_fmi.cooling.line import LineParameters
+from posmas_fmi.cooling.mapping import line_agent, slope_sector
+from posmas_fmi.design import DesignSettings, certify, design
 from posmas_fmi.design.integral import augmented, integral_design
-from posmas_fmi.errors import DesignError
+from posmas_fmi.design.lmi import graph_scalar
+from posmas_fmi.errors import DesignError, InputError
 from posmas_fmi.network import Network, network_from_arcs
 
 # a cooling line: plate, return and supply temperatures; heat retained at the supply
@@ -23,7 +33,8 @@ def ring() -> Network:
 
 def test_offset_of_unequal_loads_vanishes_for_switching_slopes() -> None:
     network = ring()
-    made = integral_design(LINE, network, LINE.C, rate=0.002)
+    graph = graph_scalar(network, LINE.sector)
+    made = integral_design(LINE, graph, LINE.C, rate=0.002)
     rng = np.random.default_rng(1)
     M = network.pinned_laplacian.toarray()
     A, B, _ = augmented(LINE, LINE.C)
@@ -41,7 +52,8 @@ def test_offset_of_unequal_loads_vanishes_for_switching_slopes() -> None:
 
 def test_quadratic_function_falls_for_every_time_varying_slope() -> None:
     network = ring()
-    made = integral_design(LINE, network, LINE.C, rate=0.002)
+    graph = graph_scalar(network, LINE.sector)
+    made = integral_design(LINE, graph, LINE.C, rate=0.002)
     rng = np.random.default_rng(2)
     M = network.pinned_laplacian.toarray()
     A, B, _ = augmented(LINE, LINE.C)
@@ -56,10 +68,134 @@ def test_quadratic_function_falls_for_every_time_varying_slope() -> None:
 
 
 def test_a_rate_out_of_reach_is_a_clear_error() -> None:
+    graph = graph_scalar(ring(), LINE.sector)
     with pytest.raises(DesignError, match="rate"):
-        integral_design(LINE, ring(), np.array([[0.0, 0.0, 0.0]]), rate=0.01)
+        integral_design(LINE, graph, np.array([[0.0, 0.0, 0.0]]), rate=0.01)
+    with pytest.raises(DesignError, match="what helps: a lower rate"):
+        design(LINE, ring(), DesignSettings(method="integral", rate=50.0), None)
 
 
 def test_wrong_shape_of_what_is_integrated() -> None:
     with pytest.raises(DesignError, match="3 columns"):
-        integral_design(LINE, ring(), np.eye(2), rate=0.01)
+        integral_design(LINE, graph_scalar(ring(), LINE.sector), np.eye(2), rate=0.01)
+
+
+# ---- rows of cooling lines -----------------------------------------------------------------------
+
+
+def cooling() -> Agent:
+    """Lines whose leakage does not depend on the temperature, valves from 40 % on."""
+    line, opening = attrs.evolve(LineParameters(), kl=0.0), (0.4, 1.0)
+    sector = slope_sector(line, (10.0, 22.0), opening)
+    return attrs.evolve(line_agent(line, opening=opening), sector=sector)
+
+
+def rows_of_lines(count: int, row: int = 10) -> Network:
+    """Undirected rings, every fifth line pinned."""
+    arcs = []
+    for first in range(0, count, row):
+        for k in range(row):
+            i, j = first + k + 1, first + (k + 1) % row + 1
+            arcs += [(i, j), (j, i)]
+    return network_from_arcs(count, arcs, list(range(1, count + 1, 5)))
+
+
+def test_a_thousand_cooling_lines_are_proved_with_small_programs() -> None:
+    agent, settings = cooling(), DesignSettings(method="integral")
+    few, many = (design(agent, rows_of_lines(n), settings, 5.0) for n in (10, 1000))
+    for made in (few, many):
+        assert made.integrates == ("y2",)
+        assert made.K_q is not None
+        assert (made.K_q < 0).all()
+        assert made.certificate.failing == ()
+        assert made.certificate.certified == "conditional"
+        assert {a.name for a in made.certificate.open_assumptions} == {"slope"}
+        names = [c.name for c in made.certificate.conditions]
+        assert "I: sampled loop contracts" in names
+        assert made.certificate.rate is not None
+        assert not made.certificate.positive
+        assert made.to_dict()["K_q"] == made.K_q.tolist()
+    # the certificate does not know how many rows there are
+    assert many.certificate.rate == few.certificate.rate
+
+
+def test_sampled_cooling_lines_with_their_gains_contract_and_leave_no_offset() -> None:
+    """Linear loops inside the claim, with slopes that differ from line to line."""
+    agent, network, h = cooling(), rows_of_lines(10), 5.0
+    made = design(agent, network, DesignSettings(method="integral"), h)
+    assert made.K_q is not None
+    assert made.certificate.rate is not None
+    M = network.pinned_laplacian.toarray()
+    flow = expm(np.block([[agent.A, np.eye(3)], [np.zeros((3, 6))]]) * h)
+    Phi, Gamma = flow[:3, :3], flow[:3, 3:]
+    rng = np.random.default_rng(0)
+    for slopes in (np.full(10, agent.m_l), np.full(10, agent.m_h), rng.choice(agent.sector, 10)):
+        # w integrates theta_s; u = M (K delta + K_q w)
+        T = np.kron(np.eye(10), np.block([[Phi, np.zeros((3, 1))], [h * agent.C[1:], np.eye(1)]]))
+        push = np.vstack([Gamma @ agent.B, [[0.0]]])
+        T += np.kron(slopes[:, None] * M, push @ np.hstack([made.K, made.K_q]))
+        radius = np.abs(np.linalg.eigvals(T)).max()
+        assert radius <= np.exp(-made.certificate.rate * h) * (1 + 1e-9)
+        load = np.zeros((10, 4))
+        load[:, :3] = rng.random((10, 3)) @ Gamma.T
+        steady = np.linalg.solve(np.eye(40) - T, load.ravel()).reshape(10, 4)
+        assert np.abs(steady[:, 2]).max() < 1e-8 * np.abs(steady[:, 0]).max()
+
+
+def test_given_integral_gains_are_certified_and_bad_ones_are_not() -> None:
+    agent, network, settings = cooling(), rows_of_lines(10), DesignSettings()
+    made = design(agent, network, attrs.evolve(settings, method="integral"), 5.0)
+    assert made.K_q is not None
+    again = certify(agent, network, made.K, made.E, settings, 5.0, made.K_q)
+    assert again.certificate.rate == pytest.approx(made.certificate.rate)
+    assert [c.holds for c in again.certificate.conditions] == [True] * 4
+    worse = certify(agent, network, made.K, made.E, settings, 5.0, -made.K_q)
+    assert worse.certificate.certified == "no"
+    with pytest.raises(InputError, match="one column per integrated output"):
+        certify(agent, network, made.K, made.E, settings, 5.0, np.ones((1, 2)))
+    for bad in (("y3",), ("y1", "y2")):
+        with pytest.raises(InputError, match="integrates"):
+            design(agent, network, DesignSettings(method="integral", integrates=bad), 5.0)
+
+
+def test_the_integral_design_is_chosen_in_a_scenario(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "tanks.toml"
+    path.write_text(
+        """
+[scenario]
+name = "tanks"
+until = 10.0
+period = 0.5
+[agent]
+A = [[-0.1]]
+B = [[1.0]]
+C = [[1.0]]
+g = ["0"]
+sec = ["u1"]
+sector = [0.8, 1.2]
+[network]
+agents = 2
+arcs = [[1, 2], [2, 1]]
+pinned = [1]
+[design]
+method = "integral"
+integrates = ["y1"]
+[leader]
+s0 = [1.0]
+""",
+        encoding="utf-8",
+    )
+    assert main(["design", str(path), "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["certified"] == "yes"
+    assert made["K_q"][0][0] < 0
+    gains = tmp_path / "design.json"
+    gains.write_text(json.dumps(made), encoding="utf-8")
+    assert main(["certify", str(path), "--gains", str(gains), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rate"] == pytest.approx(made["rate"])
+    assert main(["design", str(path)]) == 0
+    assert "K_q" in capsys.readouterr().out
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "without integrals" in capsys.readouterr().err

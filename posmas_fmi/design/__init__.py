@@ -18,6 +18,7 @@ __all__ = ["METHODS", "Baseline", "Design", "DesignSettings", "Method", "certify
 _MODULES: dict[Method, str] = {
     "contraction": "contraction",
     "lmi": "lmi",
+    "integral": "integral",
     "paper-1": "paper",
     "paper-2": "paper",
     "gains": "gains",
@@ -80,6 +81,7 @@ def certify(
     E: Array,
     settings: DesignSettings,
     period: float | None = None,
+    K_q: Array | None = None,
 ) -> Design:
     """Certificate for given gains; conditions that fail give ``"no"``, not an exception.
 
@@ -89,6 +91,8 @@ def certify(
         As for `design`.
     K : (p, m) array_like
     E : (m, q) array_like
+    K_q : (p, k) array_like, optional
+        Gain of the integrals of ``settings.integrates``: certificate I in place of P, C and T.
 
     Returns
     -------
@@ -99,5 +103,5 @@ def certify(
     InputError
         If a gain has the wrong shape.
     """
-    given = attrs.evolve(settings, method="gains", K=K, E=E)
+    given = attrs.evolve(settings, method="gains", K=K, E=E, K_q=K_q)
     return design(agent, network, given, period)

@@ -21,12 +21,37 @@ def design(
     """Certify ``settings.K`` and ``settings.E``; say what would help where that fails."""
     assert settings.K is not None, "settings check it"
     assert settings.E is not None, "settings check it"
+    if settings.K_q is not None:
+        from posmas_fmi.design import integral
+
+        return integral.certify(agent, network, settings, period)
     made = certified(agent, network, settings.K, settings.E, settings, period)
     if made.certificate.certified != "no":
         return made
     return attrs.evolve(
         made, notes=remedies(loop_of(agent, network, made.K, made.E, settings, period))
     )
+
+
+def checked_gains(agent: Agent, K: Array, E: Array) -> tuple[Array, Array]:
+    """Return gains as matrices of the right shape.
+
+    Raises
+    ------
+    InputError
+        If they are none.
+    """
+    K, E = np.atleast_2d(np.asarray(K, dtype=float)), np.atleast_2d(np.asarray(E, dtype=float))
+    for name, value, shape, words in (
+        ("K", K, (agent.p, agent.m), "(p, m), one row per input"),
+        ("E", E, (agent.m, agent.q), "(m, q), one row per state"),
+    ):
+        if value.shape != shape:
+            raise InputError(
+                f"expected a matrix of shape {shape}, that is {words} (got {value.shape})",
+                f"$.design.{name}",
+            )
+    return K, E
 
 
 def loop_of(
@@ -61,16 +86,7 @@ def certified(
     notes: tuple[str, ...] = (),
 ) -> Design:
     """Return gains with the certificate that is proved about exactly these numbers."""
-    K, E = np.atleast_2d(np.asarray(K, dtype=float)), np.atleast_2d(np.asarray(E, dtype=float))
-    for name, value, shape, words in (
-        ("K", K, (agent.p, agent.m), "(p, m), one row per input"),
-        ("E", E, (agent.m, agent.q), "(m, q), one row per state"),
-    ):
-        if value.shape != shape:
-            raise InputError(
-                f"expected a matrix of shape {shape}, that is {words} (got {value.shape})",
-                f"$.design.{name}",
-            )
+    K, E = checked_gains(agent, K, E)
     if period is not None and not 0.0 < period < np.inf:
         raise InputError(f"expected a period > 0 s (got {period!r})", "$.scenario.period")
     loop = loop_of(agent, network, K, E, settings, period)

@@ -560,7 +560,7 @@ def _instead(
     """Return quadratic conditions that take the place of C or T of the controller, and the rate."""
     if loop.period is None:
         return [], feedback.kappa
-    gain = loop.phi * feedback.K
+    gain = Fraction(repr(float(loop.phi))) * rational(feedback.K)
     proof = sampled_feedback(loop, gain, np.diag(feedback.V), graph, feedback.kappa)
     if proof is None:
         return None, None

@@ -51,6 +51,10 @@ class Design:
         Form of the paper's algorithms, where one was used.
     notes : tuple of str
         What a reader should know about how the gains came about.
+    K_q : (p, k) array or None
+        Gain of the integrals, of the integral protocol.
+    integrates : tuple of str
+        Outputs that it integrates.
     """
 
     method: str
@@ -65,6 +69,8 @@ class Design:
     protocol: Literal["corrected", "printed"] = "corrected"
     form: Literal["corrected", "printed", "joint"] = "corrected"
     notes: tuple[str, ...] = ()
+    K_q: Array | None = None
+    integrates: tuple[str, ...] = ()
 
     @property
     def pinned(self) -> tuple[str, ...]:
@@ -82,6 +88,8 @@ class Design:
             "form": self.form,
             "K": _rows(self.K),
             "E": _rows(self.E),
+            "K_q": None if self.K_q is None else _rows(self.K_q),
+            "integrates": list(self.integrates),
             "pinned": list(self.pinned),
             **self.certificate.to_dict(),
             "baseline": {

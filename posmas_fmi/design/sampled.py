@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def sampled_feedback(
     ----------
     loop : Loop
         With a period.
-    gain : (p, n) array
+    gain : (p, n) array of Fraction or float
         As it ships, coupling included.
     V : (n, n) array
         Of the continuous proof: where the search is scaled.
@@ -55,6 +56,7 @@ def sampled_feedback(
     if step is None or rate <= 0:
         return None
     exact = rational(gain)
+    gain = np.array(exact, dtype=float)
     for share_of_rate in _RATES:
         factor = math.exp(-share_of_rate * rate * h)
         gap = 1 - factor**2
@@ -138,4 +140,64 @@ def sampled_observer(loop: Loop) -> SampledProof | None:
         found = prove_observer(loop, math.exp(-share * max(fastest, 0.0) * loop.period))
         if found is not None:
             return found
+    return None
+
+
+def sampled_gain(
+    step: Step, graph: GraphScalar, factor: float, phi: float, m: int, digits: int
+) -> tuple[Array, SampledProof] | None:
+    """Gain with r per period, rounded and proved; None where there is none.
+
+    With ``Q = P⁻¹`` and ``K = -BᵀPA`` the inequality of `sampled_matrix` follows from
+    ``AQAᵀ ≺ r²(Q + cBBᵀ)`` with ``BᵀQ⁻¹B ⪯ I`` and ``c ≤ γ²/4g``, which is linear; P is scaled so
+    that the network bears the most.
+
+    Parameters
+    ----------
+    step : Step
+    graph : GraphScalar
+    factor : float
+        Wanted r.
+    phi : float
+        Coupling that the first `m` columns of the gain are divided by when they are rounded.
+    m, digits : int
+    """
+    cp = cvxpy()
+    A, B = step.A, step.B
+    n, p = B.shape
+    size = np.array([1.0] * n)
+    for _ in range(20):  # coordinates in which A is balanced
+        rows = np.abs(A / size[:, None] * size[None, :]).sum(axis=1)
+        columns = np.abs(A / size[:, None] * size[None, :]).sum(axis=0)
+        size = size * np.sqrt(np.maximum(rows, 1e-12) / np.maximum(columns, 1e-12))
+    A, B = A / size[:, None] * size[None, :], B / size[:, None]
+    unit = float(np.abs(B).max()) or 1.0
+    B = B / unit
+    Q, c = cp.Variable((n, n), symmetric=True), cp.Variable(nonneg=True)
+    limits = [
+        factor**2 * (Q + c * B @ B.T) - A @ Q @ A.T >> 1e-7 * (1 - factor**2) * np.eye(n),
+        cp.bmat([[Q, B], [B.T, np.eye(p)]]) >> 0,
+    ]
+    program = cp.Problem(cp.Minimize(c), limits)
+    try:
+        if not solve(program, "sampled integral design") or Q.value is None:
+            return None
+    except DesignError:
+        return None
+    room = graph.value**2 / (4 * graph.reach)
+    if not 0 < float(c.value) < 0.9 * room:
+        return None
+    P = np.linalg.inv(Q.value) * graph.value / (2 * graph.reach) * 0.99
+    P = P / np.outer(size, size) / unit**2
+    P = nearest(0.5 * (P + P.T), 12, relative_zero=0.0)
+    gain = -(step.B.T @ P @ step.A)
+    gain = np.hstack([nearest(gain[:, :m] / phi, digits), nearest(gain[:, m:], digits)])
+    exact = rational(gain)
+    exact[:, :m] = exact[:, :m] * Fraction(repr(float(phi)))
+    gap = 1 - factor**2
+    for eta in (1e-4 * gap, 0.1 * gap):
+        for share in (1e-3, 0.01, 0.05):
+            proof = prove_sampled(step, exact, P, graph, factor, eta, share)
+            if proof is not None:
+                return gain, proof
     return None

@@ -11,8 +11,8 @@ import numpy as np
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 
-Method = Literal["contraction", "lmi", "paper-1", "paper-2", "gains"]
-METHODS: tuple[Method, ...] = ("contraction", "lmi", "paper-1", "paper-2", "gains")
+Method = Literal["contraction", "lmi", "integral", "paper-1", "paper-2", "gains"]
+METHODS: tuple[Method, ...] = ("contraction", "lmi", "integral", "paper-1", "paper-2", "gains")
 
 
 def _optional_matrix(value: Any) -> Array | None:
@@ -51,14 +51,19 @@ class DesignSettings:
 
     Parameters
     ----------
-    method : {"contraction", "lmi", "paper-1", "paper-2", "gains"}
-        How gains are found; ``"gains"`` takes `K` and `E` as given.
+    method : {"contraction", "lmi", "integral", "paper-1", "paper-2", "gains"}
+        How gains are found; ``"gains"`` takes `K` and `E` (and `K_q`) as given.
     observer : {"local", "distributed"}
         Each agent from its own output, or from neighbours' output errors (25).
     phi, mu : float
         Coupling of controller and of the distributed observer.
     K, E : matrices, optional
         Gains (p, m) and (m, q), for ``"gains"``.
+    K_q : matrix, optional
+        Gain (p, k) of the integrals of the outputs `integrates`, for ``"gains"``.
+    integrates : sequence of str, optional
+        Outputs (``"y1"``) that the integral protocol brings to the leader's without offset; at
+        most one per input. All of them by default, or the last one where there are too many.
     objective : {"rate", "gain", "band"}
         Fastest certified rate; least gains for the wanted `rate`; smallest guaranteed band.
     rate, observer_rate : float, optional
@@ -103,6 +108,10 @@ class DesignSettings:
     mu: float = attrs.field(default=1.0, validator=_positive)
     K: Array | None = attrs.field(default=None, converter=_optional_matrix)
     E: Array | None = attrs.field(default=None, converter=_optional_matrix)
+    K_q: Array | None = attrs.field(default=None, converter=_optional_matrix)
+    integrates: tuple[str, ...] | None = attrs.field(
+        default=None, converter=attrs.converters.optional(tuple)
+    )
     objective: Literal["rate", "gain", "band"] = attrs.field(
         default="rate", validator=_one_of("rate", "gain", "band")
     )
@@ -133,7 +142,7 @@ class DesignSettings:
             )
         if self.objective == "gain" and self.rate is None:
             raise InputError('objective = "gain" needs the wanted rate', "$.design.rate")
-        for name in ("K", "E"):
+        for name in ("K", "E", "K_q"):
             value: Array | None = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise InputError("expected finite numbers", f"$.design.{name}")

@@ -257,7 +257,11 @@ def control(table: ControlTable, cooling: CoolingTable, designed: Design, place:
     """
     changes: dict[str, Any] = {
         "K": designed.phi * designed.K[0],
-        "K_q": designed.phi * float(designed.K[0].sum()) / INTEGRAL_TIME,
+        "K_q": (
+            designed.phi * float(designed.K[0].sum()) / INTEGRAL_TIME
+            if designed.K_q is None
+            else float(designed.K_q[0, 0])
+        ),
         "E": designed.E,
         "set_point": cooling.set_point,
         "floor": floor(cooling),

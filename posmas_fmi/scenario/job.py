@@ -136,6 +136,13 @@ def run(
         If nothing could be run. A run that diverges or whose FMU fails is no error but a verdict,
         and what was recorded is kept.
     """
+    integral = scenario.design.method == "integral" or scenario.design.K_q is not None
+    if integral and scenario.cooling is None:
+        raise InputError(
+            "a run simulates the protocol without integrals: 'design' and 'certify' work for this "
+            'method, and the law "integral" of a cooling row runs such gains',
+            "$.design.method",
+        )
     if scenario.compare is not None:
         if resume or branch:
             raise InputError("a comparison cannot go on; run one of its controllers", "$.compare")
