@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from fmu_examples import tank_fmu
 
 from posmas_fmi import load
+from posmas_fmi.cli import main
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.build import agent_fmu
 from posmas_fmi.fmu.check.control import control_report, lines
@@ -136,3 +138,13 @@ def test_a_way_that_an_fmu_refuses_is_no_error_of_the_fmu() -> None:
     made = check_fmu(hostile.path("Set error 150"), ["u"], ["y"])
     assert made.exit_code == 0, [str(f) for f in made.findings]
     assert [(f.severity, f.code) for f in made.findings] == [("note", "status-error")]
+
+
+@pytest.mark.parametrize("defect", ["Get nan", "Get inf", "Get absurd"])
+def test_json_is_json_whatever_an_fmu_returns(
+    defect: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = main(["check", str(hostile.path(defect)), "--in", "u", "--out", "y", "--json"])
+    (made,) = json.loads(capsys.readouterr().out)["fmus"]
+    assert made["exit_code"] == code
+    assert made["findings"]

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import tempfile
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -76,6 +81,35 @@ def test_no_file_and_no_process_is_left(checked: dict[str, Preflight], folder: P
         with suppress(OSError):
             left += [process] if str(folder) in os.readlink(process) else []
     assert left == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_check_that_is_ended_leaves_nothing(tmp_path: Path, number: int) -> None:
+    """While the FMU hangs in a step."""
+    command = [sys.executable, "-m", "posmas_fmi", "check", str(hostile.path("DoStep hang"))]
+    environment = {
+        **os.environ,
+        "TMPDIR": str(tmp_path),
+        "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+    }
+    with subprocess.Popen(
+        command,
+        env=environment,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        _until(lambda: any(tmp_path.glob("posmas-fmi-check-*/work")))
+        process.send_signal(number)
+        assert process.wait() == (130 if number == signal.SIGINT else -number)
+    _until(lambda: not list(tmp_path.iterdir()))
+
+
+def _until(true: Callable[[], bool]) -> None:
+    for _ in range(600):
+        if true():
+            return
+        time.sleep(0.1)
+    raise AssertionError("it did not come to that in a minute")
 
 
 def test_there_are_more_than_a_hundred() -> None:

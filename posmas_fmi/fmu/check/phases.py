@@ -104,7 +104,7 @@ class Trial:
         board = journal.board
         severity = journal.severity
         if board.phase == "control":
-            journal.note("note", "no-control-report", board.call, text[:500])
+            journal.note("note", "no-control-report", call or board.call, text[:500])
             return
         if text.startswith("the FMU returned no instance"):
             code = "no-instance"
@@ -474,12 +474,12 @@ PHASES: dict[str, Callable[[Trial], None]] = {
 
 
 def _difference(first: Array, then: Array) -> float:
-    """Return the largest difference of outputs, relative to the size of each."""
+    """Return the largest difference of outputs, relative to the size of each; NaN if some are."""
     n = min(len(first), len(then))
     if not n or not first.size:
         return 0.0
     both = np.stack([first[:n], then[:n]])
     if not np.isfinite(both).all():
-        return 0.0  # told elsewhere
+        return float("nan")  # told elsewhere
     size = np.maximum(np.abs(both).max(axis=(0, 1)), 1e-12)
     return float((np.abs(both[0] - both[1]) / size).max(initial=0.0))

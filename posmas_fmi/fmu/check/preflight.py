@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -82,7 +83,7 @@ class Preflight:
             "inputs": [_port(v) for v in self.ports("input")],
             "outputs": [_port(v) for v in self.ports("output")],
             "annotations": list(told.annotations) if told else [],
-            "trial": self.results,
+            "trial": _finite(self.results),
         }
 
 
@@ -203,6 +204,15 @@ def _names_exist(path: Path, told: Description, names: Sequence[str]) -> None:
         raise InputError(f"there is no variable {name!r}{hint}", str(path))
 
 
+def _finite(value: Any) -> Any:
+    """Replace numbers that JSON does not know by None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
+
+
 def _port(variable: Described) -> dict[str, Any]:
     facts = {
         "name": variable.name,
@@ -263,7 +273,7 @@ def measured(made: Preflight) -> Iterator[tuple[str, str]]:
     again = [
         f"{text} {'the same bits' if found[name] == 0 else f'off by {found[name]:.2g}'}"
         for name, text in words.items()
-        if name in found
+        if math.isfinite(found.get(name, math.nan))
     ]
     if again:
         yield "done again", ", ".join(again)

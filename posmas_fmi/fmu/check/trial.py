@@ -11,6 +11,7 @@ import ctypes
 import json
 import os
 import select
+import shutil
 import signal
 import sys
 from contextlib import suppress
@@ -37,15 +38,15 @@ def main() -> None:
         if copy == 0:
             _attempt(job)
         _say({"process": copy})
-        _say({"ended": _wait(copy)})
+        _say({"ended": _wait(copy, Path(job["folder"]))})
 
 
 def _say(content: dict[str, Any]) -> None:
     os.write(1, json.dumps(content).encode() + b"\n")
 
 
-def _wait(copy: int) -> int:
-    """Wait for the end of a copy, and end it if nobody waits for us any more."""
+def _wait(copy: int, folder: Path) -> int:
+    """Wait for the end of a copy; end it and remove its files if nobody waits for us any more."""
     while True:
         process, status = os.waitpid(copy, os.WNOHANG)
         if process:
@@ -53,6 +54,7 @@ def _wait(copy: int) -> int:
         if select.select([0], [], [], _LOOK)[0]:  # no job is sent now: it was closed
             _end_group(copy)
             os.waitpid(copy, 0)
+            shutil.rmtree(folder, ignore_errors=True)
             os._exit(0)
     _end_group(copy)
     return os.waitstatus_to_exitcode(status)
