@@ -1,11 +1,16 @@
 """CPU time per agent and communication step: engine, numpy path and other masters over the floor.
 
-    python benchmarks/engine.py [--agents 9 100 1000] [--repeat 5]
+    python benchmarks/engine.py [--agents 9 100 1000 10000] [--fmi 3 2] [--rounds 200]
 
 All in one run, 1 ms steps of the paper's Example 1. The floor is a loop in C over the same FMUs
 that only sets u, steps and gets y, with the inputs of the controlled run. Engine and numpy path do
-all of the master's work besides: observer, protocol, exchange, checks, reading x. The other masters
-do less: they step the FMUs without any controller or connection.
+all of the master's work besides: observer, protocol, exchange, checks, reading x.
+
+Floor, engine and numpy path take turns every millisecond or so, each with FMUs of its own, and of
+each the fastest turn counts (CPU time of the thread): what else the machine does falls on all alike
+and is left out. The other masters do less than the engine: they step the FMUs without a controller
+or a connection. Only the FMPy loop is also measured with the controllers as a few lines of numpy:
+that is the plain loop that does the same work.
 """
 
 from __future__ import annotations
@@ -22,6 +27,8 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 
 import attrs
@@ -37,7 +44,6 @@ from posmas_fmi.cosim.master import System
 from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.compile import find_compiler, host
-from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
@@ -104,6 +110,18 @@ def per_step(setting: Setting, run: Callable[[], None], clock: Callable = time.p
     return (clock() - began) / setting.n / setting.steps * 1e9
 
 
+Verdicts = list[tuple[str, float, float, bool]]  # what, value, target, whether less is better
+
+
+def tell(verdicts: Verdicts) -> None:
+    """Print each target with its figure."""
+    print("\ntargets")
+    for what, value, target, less in verdicts:
+        met = value <= target if less else value >= target
+        short = "met" if met else f"falls short by {abs(value / target - 1):.0%}"
+        print(f"  {what:58} {value:8.3g} ({'at most' if less else 'at least'} {target:g}): {short}")
+
+
 # ---- what is compared ----------------------------------------------------------------------------
 
 
@@ -123,46 +141,92 @@ def floor_library(folder: Path) -> ctypes.CDLL:
     return ctypes.CDLL(str(output))
 
 
-def floor(setting: Setting, library: ctypes.CDLL, inputs: np.ndarray) -> float:
-    pointer, size, word = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int64
-    function = library.floor_run
-    function.argtypes = [
-        *(ctypes.c_int, pointer, pointer, pointer, pointer, word),
-        *(pointer, size, size, pointer, size, size, ctypes.c_double, pointer, word, word),
-    ]
-    function.restype = word
-    with FmuFile(setting.fmu) as file:
-        instances = []
-        for x in np.random.default_rng(1).uniform(0, 2, (setting.n, 2)):
-            instances.append(file.instantiate("agent"))
-            matrices = {k: getattr(setting.agent, k) for k in "AHBC"}
-            instances[-1].initialise({**matrices, "x": x})
-        u, y = file.ports(["u"]), file.ports(["y"])
-        components = np.array([i.component for i in instances], dtype=np.uintp)
-        address = [file.address(f"fmi3{f}") for f in ("SetFloat64", "DoStep", "GetFloat64")]
+class Turns:
+    """Floor, engine and numpy path in turns over the same stretch of the run."""
 
-        def run() -> None:
+    def __init__(self, setting: Setting, per_turn: int, library: ctypes.CDLL) -> None:
+        self.setting, self.per_turn = setting, per_turn
+        self._inputs = inputs_of(setting)
+        self._plants = [setting.plant() for _ in range(4)]
+        self._floor = self._bind(library)
+        choice = engine.choose(setting.system().law, "c")
+        self._engines = []
+        for plant, variables in zip(self._plants[1:], ((), engine.VARIABLES), strict=False):
+            one = engine.Engine(setting.system(), plant, native.load(choice.library), 1, variables)
+            one._begin()
+            self._engines.append(one)
+
+    def _bind(self, library: ctypes.CDLL) -> Callable[[int, int], None]:
+        pointer, size, word = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int64
+        function = library.floor_run
+        function.argtypes = [
+            *(ctypes.c_int, pointer, pointer, pointer, pointer, word),
+            *(pointer, size, size, pointer, size, size, ctypes.c_double, pointer, word, word),
+        ]
+        function.restype = word
+        instances = self._plants[0]._instances
+        file, n = instances[0].file, self.setting.n
+        real = "Real" if file.version == 2 else "Float64"
+        address = [
+            file.address(f"fmi{file.version}{f}") for f in (f"Set{real}", "DoStep", f"Get{real}")
+        ]
+        u, y = file.ports(["u[1]"]), file.ports(["y[1]", "y[2]"])
+        components = np.array([i.component for i in instances], dtype=np.uintp)
+
+        def run(begin: int, end: int) -> None:
             bad = function(
-                *(3, *address, components.ctypes.data, setting.n),
-                *(ctypes.addressof(u.references), 1, u.size),
-                *(ctypes.addressof(y.references), 1, y.size),
-                *(H, inputs.ctypes.data, 0, setting.steps),
+                *(file.version, *address, components.ctypes.data, n),
+                *(ctypes.addressof(u.references), len(u.references), u.size),
+                *(ctypes.addressof(y.references), len(y.references), y.size),
+                *(H, self._inputs[begin:].ctypes.data, begin, end),
             )
             assert bad == 0
 
-        return per_step(setting, run)
+        return run
 
+    def _engine(self, one: engine.Engine, end: int) -> None:
+        e = one._e
+        while e.k < end:
+            e.until = min(end, e.k + one._room) if one._rows else end
+            one._call()
 
-def engine_run(setting: Setting, record: bool = False, which: engine.Wanted = "c") -> float:
-    system = setting.system()
-    choice = engine.choose(system.law, which)
-    with setting.plant() as plant:
-        if which == "numpy":
-            return per_step(setting, lambda: engine.run(system, plant, choice=choice))
-        library = native.load(choice.library)
-        one = engine.Engine(system, plant, library, 1, engine.VARIABLES if record else ())
-        keep = (lambda *_: None) if record else None
-        return per_step(setting, lambda: one.run(keep, None))
+    def best(self, rounds: int) -> dict[str, float]:
+        """Smallest CPU time per agent and step [ns] of each."""
+        runs: dict[str, Callable[[int, int], None]] = {
+            "floor": self._floor,
+            "engine": lambda _, end: self._engine(self._engines[0], end),
+            "engine, recording": lambda _, end: self._engine(self._engines[1], end),
+        }
+        best = dict.fromkeys(runs, math.inf)
+        for turn in range(rounds):
+            begin, end = turn * self.per_turn, (turn + 1) * self.per_turn
+            for name, run in runs.items():
+                began = time.thread_time()
+                run(begin, end)
+                best[name] = min(best[name], time.thread_time() - began)
+        numpy = self._numpy(max(20, min(200, rounds)))
+        steps = self.setting.n / 1e9
+        return {
+            **{name: value / steps / self.per_turn for name, value in best.items()},
+            "numpy path": numpy / steps,
+        }
+
+    def _numpy(self, steps: int) -> float:
+        times: list[float] = []
+        short = attrs.evolve(self.setting, steps=steps)
+        system = short.system()
+        choice = engine.choose(system.law, "numpy")
+        engine.run(
+            system,
+            self._plants[3],
+            choice=choice,
+            progress=lambda *_: times.append(time.thread_time()),
+        )
+        return float(np.diff(times).min())
+
+    def close(self) -> None:
+        for plant in self._plants:
+            plant.close()
 
 
 def fmpy_loop(setting: Setting, controlled: bool = False) -> float:
@@ -294,6 +358,81 @@ def ecos(setting: Setting) -> float:
         return per_step(setting, lambda: simulation.step(setting.steps))
 
 
+def mosaik_master(setting: Setting) -> float:
+    """A mosaik scenario whose simulator steps one FMU per entity with FMPy."""
+    try:
+        import mosaik
+        import mosaik_api_v3
+    except ImportError as error:
+        raise Skip(str(error)) from error
+    import fmpy
+    from fmpy.fmi2 import FMU2Slave
+
+    path = str(agent_fmu_2(setting))
+    folder = fmpy.extract(path)
+    description = fmpy.read_model_description(folder)
+    identifier = description.coSimulation.modelIdentifier
+
+    class Plant(mosaik_api_v3.Simulator):
+        """mosaik-fmi does not install (its fmipp does not build): this is what it would do."""
+
+        def __init__(self) -> None:
+            model = {"public": True, "params": [], "attrs": ["y"]}
+            super().__init__({"type": "time-based", "models": {"Agent": model}})
+            self.slaves: list[FMU2Slave] = []
+
+        def init(self, sid: str, time_resolution: float = 1.0, **_: object) -> dict:
+            return self.meta
+
+        def create(self, num: int, model: str, **_: object) -> list[dict]:
+            entities = []
+            for _index in range(num):
+                k = len(self.slaves)
+                slave = FMU2Slave(
+                    guid=description.guid,
+                    unzipDirectory=folder,
+                    modelIdentifier=identifier,
+                    instanceName=str(k),
+                )
+                slave.instantiate()
+                slave.setupExperiment()
+                slave.enterInitializationMode()
+                slave.exitInitializationMode()
+                self.slaves.append(slave)
+                entities.append({"eid": str(k), "type": model})
+            return entities
+
+        def step(self, now: int, inputs: dict, max_advance: int) -> int:
+            for slave in self.slaves:
+                slave.doStep(currentCommunicationPoint=now * H, communicationStepSize=H)
+            return now + 1
+
+        def get_data(self, outputs: dict) -> dict:
+            return {}
+
+    plants: list[Plant] = []
+
+    class One(Plant):
+        def __init__(self) -> None:
+            super().__init__()
+            plants.append(self)
+
+    globals()["MosaikAgents"] = One
+    try:
+        from loguru import logger
+
+        logger.remove()
+    except (ImportError, ValueError):
+        pass
+    world = mosaik.World({"Agents": {"python": f"{__name__}:MosaikAgents"}}, skip_greetings=True)
+    try:
+        for _ in range(setting.n):  # one simulator per FMU, as mosaik-fmi has it
+            world.start("Agents").Agent()
+        return per_step(setting, lambda: world.run(until=setting.steps, print_progress=False))
+    finally:
+        world.shutdown()
+
+
 # ---- threads and start-up ------------------------------------------------------------------------
 
 SLOW_C = """
@@ -303,7 +442,7 @@ SLOW_C = """
 void model_derivatives(double t, const double *p, const double *u, const double *x, double *dx)
 {
     double sum = 0;
-    for (int k = 0; k < 110; k++)
+    for (int k = 0; k < 150; k++)
         sum += sin(t + k * x[0]);
     dx[0] = u[0] - x[0] + 1e-3 * sum;
     dx[1] = -p[0] * x[1];
@@ -328,7 +467,7 @@ void model_directional(double t, const double *p, const double *u, const double 
 """
 
 
-def threads(repeat: int) -> None:
+def threads(repeat: int) -> Verdicts:
     variables = (
         Variable("p", "parameter", (1,), (1.0,)),
         Variable("u", "input", (1,), (0.0,)),
@@ -336,82 +475,169 @@ def threads(repeat: int) -> None:
         Variable("y", "output", (2,), depends=("x",)),
     )
     path = fmu(FmuModel("slow", "", variables, {"model.c": SLOW_C}, Experiment()))
-    setting = Setting.of(100, 200)
+    stretch, repeat = 4, 60 * repeat
+    setting = Setting.of(100, stretch * repeat + 1)
     choice = engine.choose(setting.system().law, "c")
-    wall: dict[int, float] = {}
-    for _ in range(repeat):
-        for count in (1, 2):
-            with setting.plant(path) as plant:
-                one = engine.Engine(setting.system(), plant, native.load(choice.library), count, ())
-                took = per_step(setting, lambda one=one: one.run(None, None), time.perf_counter)
-                wall[count] = min(wall.get(count, math.inf), took)
+    library = native.load(choice.library)
+    wall = dict.fromkeys(("one", "two", "apart"), math.inf)
+    with ExitStack() as stack:
+
+        def begun(of: Setting, count: int) -> engine.Engine:
+            plant = stack.enter_context(of.plant(path))
+            one = engine.Engine(of.system(), plant, library, count, ())
+            one._begin()
+            return one
+
+        def go(one: engine.Engine) -> None:
+            one._e.until = one._e.k + stretch
+            one._call()
+
+        one, two = begun(setting, 1), begun(setting, 2)
+        halves = [begun(attrs.evolve(setting, n=setting.n // 2), 1) for _ in range(2)]
+        pool = stack.enter_context(ThreadPoolExecutor(2))
+        runs = {
+            "one": lambda: go(one),
+            "two": lambda: go(two),
+            "apart": lambda: list(pool.map(go, halves)),
+        }
+        for _ in range(repeat):  # short stretches: now and then both processors are free
+            for name, run in runs.items():
+                began = time.perf_counter()
+                run()
+                took = (time.perf_counter() - began) / stretch / setting.n * 1e9
+                wall[name] = min(wall[name], took)
     print(
-        f"\n{wall[1] / 1000:.1f} us per agent-step on one thread, two are {wall[1] / wall[2]:.2f} "
-        f"times as fast (wall time; {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f})"
+        f"\n{wall['one'] / 1000:.1f} us per agent-step on one thread, two are "
+        f"{wall['one'] / wall['two']:.2f} times as fast; two engines that do not wait for each "
+        f"other {wall['one'] / wall['apart']:.2f} times: what the machine gives (wall time; "
+        f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f})"
     )
+    times = wall["one"] / wall["two"]
+    return [("two threads, 10 us per step: times as fast", times, 1.6, False)]
 
 
-def start_up(repeat: int) -> None:
+def start_up(repeat: int) -> Verdicts:
     best = {}
     for n in (1, 1000, 10_000):
         setting = Setting.of(n, 1)
         for _ in range(repeat):
-            began = time.perf_counter()
+            began = time.process_time()
             plant = setting.plant()
-            best[n] = min(best.get(n, math.inf), time.perf_counter() - began)
+            best[n] = min(best.get(n, math.inf), time.process_time() - began)
             plant.close()
     print(
         f"\nstart-up: first instance {best[1] * 1e3:.1f} ms, 1000 instances "
         f"{(best[1000] - best[1]) * 1e3:.0f} ms more, 10000 {(best[10_000] - best[1]) * 1e3:.0f} ms"
+        " (CPU time)"
     )
+    return [("start-up of 1000 instances after the first [s]", best[1000] - best[1], 0.1, True)]
+
+
+def memory_per_agent() -> Verdicts:
+    """All that an agent takes, in kB: Python objects, the engine's arrays, and its FMU as well."""
+    n = 10_000
+    setting = Setting.of(n, 100)
+    Setting.of(10, 1).plant().close()  # everything is loaded
+    began = _resident()
+    with setting.plant() as plant:
+        system = setting.system()
+        choice = engine.choose(system.law, "c")
+        one = engine.Engine(system, plant, native.load(choice.library), 1, engine.VARIABLES)
+        one.run(lambda *_: None, None)
+        per_agent = (_resident() - began) / n
+    print(f"\nmemory: {per_agent:.1f} kB per agent of {n}, its FMU included")
+    return [("memory per agent of 10000, its FMU included [kB]", per_agent, 20.0, True)]
+
+
+def _resident() -> float:
+    """Resident memory of this process [kB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1000
 
 
 # ---- the table -----------------------------------------------------------------------------------
 
+PEERS: dict[str, Callable[[Setting], float]] = {
+    "libcosimpy": libcosim,
+    "ecospy": ecos,
+    "mosaik": mosaik_master,
+    "fmpy.ssp": fmpy_ssp,
+    "FMPy loop": fmpy_loop,
+    "FMPy, controlled": lambda setting: fmpy_loop(setting, controlled=True),
+}
+ENGINE = {9: 1.25, 1000: 1.15}  # targets, over the floor
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--agents", type=int, nargs="+", default=[9, 100, 1000])
+    parser.add_argument("--agents", type=int, nargs="+", default=[9, 100, 1000, 10_000])
+    parser.add_argument("--fmi", type=int, nargs="+", default=[3, 2])
+    parser.add_argument("--rounds", type=int, default=600)
     parser.add_argument("--repeat", type=int, default=5)
     options = parser.parse_args()
+    verdicts = memory_per_agent()  # first: what others free is not given back to the system
     with tempfile.TemporaryDirectory() as folder:
         library = floor_library(Path(folder))
-        for n in options.agents:
-            table(n, library, options.repeat)
-    threads(options.repeat)
-    start_up(options.repeat)
+        for fmi in options.fmi:
+            cost = {}
+            for n in options.agents:
+                # the peers run FMI 2, and are compared once
+                best, more = table(n, fmi, library, options.rounds, with_peers=fmi == 3)
+                cost[n] = best["engine"]
+                verdicts += more
+            flat = [value for n, value in cost.items() if n >= 100]
+            if len(flat) > 1:
+                spread = max(flat) / min(flat)
+                verdicts.append((f"FMI {fmi}: dearest over cheapest, N >= 100", spread, 1.15, True))
+    verdicts += threads(options.repeat) + start_up(options.repeat)
+    tell(verdicts)
 
 
-def table(n: int, library: ctypes.CDLL, repeat: int) -> None:
-    ours, theirs = Setting.of(n, max(500, 100_000 // n)), Setting.of(n, max(20, 2000 // n))
-    inputs = inputs_of(ours)
-    fast = {
-        "floor": lambda: floor(ours, library, inputs),
-        "engine": lambda: engine_run(ours),
-        "engine, recording": lambda: engine_run(ours, record=True),
-    }
-    best = dict.fromkeys(fast, math.inf)
-    for _ in range(repeat):
-        for name, run in fast.items():
-            best[name] = min(best[name], run())
-    slow = {
-        "numpy path": lambda: engine_run(attrs.evolve(ours, steps=ours.steps // 5), which="numpy"),
-        "libcosimpy": lambda: libcosim(theirs),
-        "ecospy": lambda: ecos(theirs),
-        "fmpy.ssp": lambda: fmpy_ssp(theirs),
-        "FMPy loop": lambda: fmpy_loop(theirs),
-        "FMPy, controlled": lambda: fmpy_loop(theirs, controlled=True),
-    }
-    print(f"\n{n} agents, CPU time per agent and step of {H * 1e3:g} ms")
+def table(
+    n: int, fmi: int, library: ctypes.CDLL, rounds: int, with_peers: bool
+) -> tuple[dict[str, float], Verdicts]:
+    per_turn = max(2, 3000 // n)
+    rounds = max(20, min(rounds, 600_000 // n))
+    turns = Turns(Setting.of(n, rounds * per_turn + 1, fmi), per_turn, library)
+    best = turns.best(rounds)
+    turns.close()
+    print(f"\n{n} agents, FMI {fmi}, CPU time per agent and step of {H * 1e3:g} ms")
     for name, value in best.items():
-        print(f"  {name:18} {value:10.0f} ns {value / best['floor']:8.2f}")
-    for name, run in slow.items():
+        print(f"  {name:18} {value:10.0f} ns {value / best['floor']:8.2f}", flush=True)
+    over = {name: value / best["floor"] for name, value in best.items()}
+    verdicts: Verdicts = []
+    if n in ENGINE:
+        verdicts.append(
+            (f"FMI {fmi}, N = {n}: engine over the floor", over["engine"], ENGINE[n], True)
+        )
+    if n == 1000:
+        verdicts.append(
+            (f"FMI {fmi}, N = {n}: numpy path over the floor", over["numpy path"], 1.5, True)
+        )
+    if not with_peers or n > 1000:
+        return best, verdicts
+    peers = {}
+    setting = Setting.of(n, max(20, 2000 // n))
+    for name, run in PEERS.items():
         try:
-            value = min(run() for _ in range(2))
+            peers[name] = min(run(setting) for _ in range(2))
         except Skip as reason:
             print(f"  {name:18} left out: {str(reason)[:100]}")
             continue
-        print(f"  {name:18} {value:10.0f} ns {value / best['floor']:8.2f}")
+        print(f"  {name:18} {peers[name]:10.0f} ns {peers[name] / best['floor']:8.2f}", flush=True)
+    plain = peers.pop("FMPy, controlled") / best["engine"]
+    verdicts.append(
+        (
+            f"N = {n}: engine ahead of the best peer (uncontrolled)",
+            min(peers.values()) / best["engine"],
+            8.0,
+            False,
+        )
+    )
+    verdicts.append(
+        (f"N = {n}: engine ahead of the plain FMPy loop, same work", plain, 200.0, False)
+    )
+    return best, verdicts
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import ctypes
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import attrs
@@ -193,7 +193,7 @@ class Ports:
     size: int
     places: np.ndarray[Any, np.dtype[np.intp]]
 
-    @property
+    @cached_property
     def partial(self) -> bool:
         """Whether some elements of the variables touched are not named."""
         return len(set(self.places.tolist())) < self.size
@@ -305,4 +305,9 @@ class Variables:
 
 def pointer(values: np.ndarray[Any, Any]) -> Any:
     """Return values as the FMI functions take them; the array must outlive the call."""
-    return values.ctypes.data_as(ctypes.POINTER(np.ctypeslib.as_ctypes_type(values.dtype)))
+    return values.ctypes.data_as(_pointer_type(values.dtype))
+
+
+@cache
+def _pointer_type(dtype: np.dtype[Any]) -> Any:
+    return ctypes.POINTER(np.ctypeslib.as_ctypes_type(dtype))
