@@ -70,6 +70,10 @@ class NotBuiltError(InputError):
     """A command of the contract that this version does not have yet."""
 
 
+class ResultsError(PosmasError):
+    """Results cannot be written: the disk is full, say; what was written before stays readable."""
+
+
 class DesignError(PosmasError):
     """No gains with the wanted properties exist, or the method did not find any (exit code 1)."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
@@ -11,12 +13,13 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import InputError, ResultsError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
 CHUNK = 512  # rows held in memory before they are written,
 HELD = 16_000_000  # or fewer: bytes
+SPARE = 250_000  # bytes that the file itself may need, beside the rows
 
 
 @attrs.frozen
@@ -97,11 +100,13 @@ class Recorder:
         self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
         self._written = dict(self._taken)
         self._held = 0  # bytes
+        self._path, self._full = path, False
         if keep is not None:
             self._go_on(path, keep)
             return
         # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
         self._disk = h5py.File(path, "w", track_order=True)
+        self._reserve(SPARE)
         self._file = h5netcdf.File(self._disk, "a")
         self._define(network, variables, attributes)
         # rows go past h5netcdf, which takes milliseconds for each write
@@ -165,6 +170,7 @@ class Recorder:
             )
         file.attrs.update({**attributes, "complete": 0})
         self._disk.flush()
+        self._release()
 
     def record(self, time: float, values: dict[str, Array]) -> None:
         """Add one row; the arrays are copied. A variable that is left out stays NaN there."""
@@ -187,7 +193,16 @@ class Recorder:
             self.flush()
 
     def flush(self) -> None:
-        """Write what is held in memory."""
+        """Write what is held in memory.
+
+        Raises
+        ------
+        ResultsError
+            If there is no room for it; what was written before stays.
+        """
+        if self._full or not any(self._blocks.values()):
+            return
+        self._reserve(SPARE + sum(map(self._growth, self._data)))
         for name, data in self._data.items():
             if len(data) < self._taken["time"]:
                 data.resize(self._taken["time"], axis=0)
@@ -199,6 +214,34 @@ class Recorder:
         self._written = dict(self._taken)
         self._held = 0
         self._disk.flush()
+        self._release()
+
+    def _growth(self, name: str) -> int:
+        """Bytes that the file grows by at most, for one variable."""
+        data = self._data[name]
+        rows = data.chunks[0]
+        chunks = -(-self._taken["time"] // rows) - self._written[name] // rows
+        return int(chunks * rows * np.prod(data.shape[1:], dtype=int) * data.dtype.itemsize)
+
+    def _reserve(self, size: int) -> None:
+        """Have the system set room aside: when HDF5 finds none, the file is lost."""
+        if not hasattr(os, "posix_fallocate"):
+            return
+        try:
+            os.posix_fallocate(self._disk.id.get_vfd_handle(), self._disk.id.get_filesize(), size)
+        except OSError as error:
+            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # not on this file system
+                return
+            self._full = True
+            raise ResultsError(
+                f"no room for more results: {error.strerror}; what was written stays readable",
+                str(self._path),
+            ) from None
+
+    def _release(self) -> None:
+        """Give back what was set aside and not needed."""
+        if hasattr(os, "posix_fallocate"):
+            os.ftruncate(self._disk.id.get_vfd_handle(), self._disk.id.get_filesize())
 
     @property
     def rows(self) -> int:
@@ -208,13 +251,16 @@ class Recorder:
     def finish(self) -> None:
         """Write the rest and mark the result as complete."""
         self.flush()
-        self._file.attrs["complete"] = 1
+        if not self._full:
+            self._file.attrs["complete"] = 1
 
     def close(self) -> None:
         """Write the rest and close the file; `complete` stays as it is."""
-        self.flush()
-        self._file.close()
-        self._disk.close()
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+            self._disk.close()
 
     def __enter__(self) -> Recorder:
         return self

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import tempfile
 import weakref
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,6 +17,7 @@ from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
+from posmas_fmi.fmu.scratch import Scratch
 from posmas_fmi.fmu.units import Conversion, Units
 from posmas_fmi.fmu.variables import Ports, Variable
 
@@ -86,10 +86,8 @@ class FmuFile:
         folder = None
         try:
             if unpacked is None:
-                folder = tempfile.TemporaryDirectory(
-                    prefix="posmas-fmi-", ignore_cleanup_errors=True
-                )
-                unpacked = Path(folder.name)
+                folder = Scratch()
+                unpacked = folder.folder
                 unpack(self.path, unpacked)
             self._open(unpacked)
         except BaseException:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import itertools
-import tempfile
 from typing import Any
 
 import attrs
 
 from posmas_fmi.fmu.callbacks import Messages
+from posmas_fmi.fmu.scratch import Scratch
 
 KEYS = itertools.count(1)
 
@@ -53,7 +53,7 @@ def release(
     instances: dict[int, Live],
     frees: Frees,
     unload: Any,
-    folder: tempfile.TemporaryDirectory[str] | None,
+    folder: Scratch | None,
 ) -> None:
     """Free all instances, the library and the unpacked files."""
     for key in list(instances):

@@ -25,6 +25,7 @@ from posmas_fmi.design import Design, design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.about import read_about
+from posmas_fmi.fmu.scratch import sweep
 from posmas_fmi.fmu.start_values import grouped
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
@@ -178,6 +179,7 @@ def run_designed(
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
     make_folder(folder)
+    sweep()
     told = manifest(scenario, files, choice, command)
     beginning = Beginning()
     if resume:

@@ -6,12 +6,10 @@ import ctypes
 import logging
 import os
 import select
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 import weakref
 from collections.abc import Mapping, Sequence
@@ -28,6 +26,7 @@ from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import REASONS, Limits
 from posmas_fmi.cosim.worker.server import Settings
 from posmas_fmi.errors import BuildError, FmuError, FmuLostError, PosmasError
+from posmas_fmi.fmu.scratch import Scratch
 
 _LOG = logging.getLogger(__name__)
 
@@ -117,12 +116,18 @@ class WorkerProcess:
             getattr(self._library, name).argtypes = [ctypes.c_void_p]
         self._library.remote_ended.restype = ctypes.c_int64
         self._patience = patience
-        folder = Path(tempfile.mkdtemp(prefix="posmas-fmi-worker-"))
+        scratch = Scratch("posmas-fmi-worker-")
         memory = layout.shared_file("posmas-fmi-worker", layout.HeadMemory.size())
         output = _append(layout.shared_file("posmas-fmi-output"))
         ours, theirs = socket.socketpair()
         settings = Settings(
-            theirs.fileno(), memory, output, str(folder), str(path), attrs.asdict(limits), spins
+            theirs.fileno(),
+            memory,
+            output,
+            str(scratch.folder),
+            str(path),
+            attrs.asdict(limits),
+            spins,
         )
         try:
             with theirs:
@@ -138,7 +143,7 @@ class WorkerProcess:
         except BaseException:
             ours.close()
             os.close(output)
-            shutil.rmtree(folder, ignore_errors=True)
+            scratch.cleanup()
             raise
         finally:
             shared = layout.HeadMemory.of(memory)
@@ -149,7 +154,7 @@ class WorkerProcess:
         self.messages = NativeMessages(self._library, shared.messages)
         self.entry = layout.Worker(ctypes.addressof(self.head), self._process.pid)
         ask = (self._library.remote_ask, self.entry, self.head)
-        self._end = weakref.finalize(self, _release, self._process, ask, ours, output, folder)
+        self._end = weakref.finalize(self, _release, self._process, ask, ours, output, scratch)
 
     @property
     def alive(self) -> bool:
@@ -271,7 +276,7 @@ def _release(
     ask: tuple[Any, layout.Worker, layout.Head],
     link: socket.socket,
     output: int,
-    folder: Path,
+    scratch: Scratch,
 ) -> None:
     try:
         if process.poll() is None:
@@ -286,7 +291,7 @@ def _release(
     finally:
         link.close()
         os.close(output)
-        shutil.rmtree(folder, ignore_errors=True)
+        scratch.cleanup()
 
 
 def _say_goodbye(link: socket.socket) -> None:
