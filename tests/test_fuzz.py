@@ -69,6 +69,13 @@ def test_expressions_of_any_words(words: list[str]) -> None:
     READERS["expression"]("".join(words).encode())
 
 
+def test_a_run_that_would_never_end_is_refused() -> None:
+    """Found by fuzzing: it ended with an OverflowError."""
+    good = beginnings("scenario")[0]
+    READERS["scenario"](good.replace(b"until = 10.0", b"until = 1e308"))
+    READERS["scenario"](good.replace(b"period = 0.005", b"period = 1e308"))
+
+
 @settings(max_examples=100)
 @given(data=other_values())
 def test_scenarios_with_any_values(data: bytes) -> None:

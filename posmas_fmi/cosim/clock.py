@@ -7,6 +7,7 @@ import attrs
 from posmas_fmi.errors import InputError
 
 TICKS_PER_SECOND = 1_000_000_000
+LONGEST = 9e9  # s: nanoseconds are counted in 64 bits
 
 
 @attrs.frozen
@@ -37,8 +38,14 @@ class Clock:
         Raises
         ------
         InputError
-            If the period is no whole number of nanoseconds, or `until` no multiple of it.
+            If the period is no whole number of nanoseconds, or `until` no multiple of it, or one
+            of them is longer than `LONGEST`.
         """
+        for name, value in (("period", period), ("until", until)):
+            if not abs(value) <= LONGEST:
+                raise InputError(
+                    f"expected at most {LONGEST:g} s (got {value!r} s)", f"$.scenario.{name}"
+                )
         ticks = round(period * TICKS_PER_SECOND)
         if ticks < 1 or abs(ticks - period * TICKS_PER_SECOND) > max(1e-3, 1e-14 * ticks):
             raise InputError(
