@@ -206,6 +206,9 @@ assert min(gain.values()) > 0.4
 # | water can run short | the distributed controller with integral and feedforward |
 # | only some lines are told the set-point | the same |
 #
+# Comparisons like these ship as scenarios, `posmas-fmi run cooling_common_mode` and
+# `cooling_shortage`, with more controllers and a page of key figures.
+#
 # The sharing costs something: with ample water the distributed controller is worse than PI by the
 # figures of the first table. No run here is a proof: certificate P, C and T above are about the
 # proportional form, and what is proved of each controller is said in
