@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import re
 
+import attrs
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -219,3 +221,34 @@ def test_states_that_no_input_reaches_directly(period: float | None) -> None:
     assert made.certificate.rate is not None
     assert made.baseline.rate is not None
     assert made.certificate.rate > made.baseline.rate * 1.01
+
+
+@pytest.mark.parametrize("observer", ["local", "distributed"])
+@pytest.mark.parametrize("period", [0.005, None])
+def test_objectives_do_what_they_say(observer: str, period: float | None) -> None:
+    agent, network = EXAMPLE_1.agent("tanh"), EXAMPLE_1.network(2)
+    common = {"phi": 10.0, "mu": 15.0, "observer": observer, "disturbance": (0.05, 1.0)}
+    fast, small, narrow = (
+        design(agent, network, DesignSettings(**common, **wanted), period)
+        for wanted in ({}, {"objective": "gain", "rate": 0.1}, {"objective": "band"})
+    )
+    assert small.certificate.rate == pytest.approx(0.1, rel=1e-3)
+    assert np.abs(small.K).sum() < 0.8 * np.abs(fast.K).sum()
+    assert fast.certificate.rate > 2 * small.certificate.rate
+    widths = [np.max(made.certificate.band) for made in (narrow, fast, small)]
+    assert widths[0] <= widths[1] * (1 + 1e-6) < widths[2]
+
+
+def test_a_sector_that_begins_too_low_is_told_where_it_has_to_begin() -> None:
+    agent = attrs.evolve(EXAMPLE_1.agent("tanh"), sector=(0.0, 1.2))
+    with pytest.raises(DesignError, match=r"m_l = 0\.\d+ instead of 0 gives") as caught:
+        design(agent, EXAMPLE_1.network(2), DesignSettings(phi=10.0), 0.005)
+    low = float(re.search(r"m_l = ([\d.]+)", str(caught.value)).group(1))
+    for m_l, works in ((low * 1.01, True), (low * 0.98, False)):
+        nearby = attrs.evolve(agent, sector=(m_l, 1.2))
+        if works:
+            made = design(nearby, EXAMPLE_1.network(2), DesignSettings(phi=10.0), 0.005)
+            assert made.certificate.failing == ()
+        else:
+            with pytest.raises(DesignError, match="clash"):
+                design(nearby, EXAMPLE_1.network(2), DesignSettings(phi=10.0), 0.005)

@@ -47,8 +47,12 @@ def clash(
         )
     else:
         text += "; no gain contracts even without positivity"
-    helps = _period(problem, wanted) + (_pins(loop, problem, wanted) if controller else [])
-    advice = "; ".join(helps) if helps else "no single change of pin or period was found to help"
+    helps = _period(problem, wanted)
+    if controller:
+        helps += _pins(loop, problem, wanted) + _sector(loop, problem, wanted)
+    advice = (
+        "; ".join(helps) if helps else "no single change of pin, period or sector was found to help"
+    )
     return DesignError(f"{text}. What helps: {advice}", "$.design")
 
 
@@ -66,6 +70,23 @@ def _period(problem: Problem, wanted: float) -> list[str]:
         if rate is not None:
             return [f"a period of {h:.3g} s instead of {problem.period:.3g} s gives {rate:.3g} 1/s"]
     return []
+
+
+def _sector(loop: Loop, problem: Problem, wanted: float) -> list[str]:
+    """Smallest lower end of the sector that works, to three digits; the rest unchanged."""
+    m_l, m_h = loop.agent.m_l, loop.agent.m_h
+    whole = loop.weights_perron.rate / float((loop.network.in_degree + loop.network.pinning).max())
+
+    def rate(low: float) -> float | None:
+        return _works(attrs.evolve(problem, ratio=whole * low / m_h), wanted)
+
+    if m_l >= m_h or rate(m_h) is None:
+        return []
+    low, high = m_l, m_h
+    while high - low > 1e-3 * m_h:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rate(middle) is None else (low, middle)
+    return [f"a sector from m_l = {high:.3g} instead of {m_l:.3g} gives {rate(high):.2g} 1/s"]
 
 
 def _pins(loop: Loop, problem: Problem, wanted: float) -> list[str]:
