@@ -185,9 +185,9 @@ def test_mistakes_are_named(tmp_path, old, new, message) -> None:
 
 def test_unknown_laws_and_parameters_are_named(row, designed) -> None:
     with pytest.raises(InputError, match=r"parameters.kq: unknown key; known keys: K, K_q"):
-        cooling_law(ControlTable("integral", {"kq": -1.0}), row.cooling, designed)
+        cooling_law(ControlTable("integral", parameters={"kq": -1.0}), row.cooling, designed)
     with pytest.raises(InputError, match="expected a number > 0"):
-        cooling_law(ControlTable("pi", {"Ti": 0.0}), row.cooling, designed)
+        cooling_law(ControlTable("pi", parameters={"Ti": 0.0}), row.cooling, designed)
     twice = attrs.evolve(row, compare=CompareTable(["pi", "pi", "best"], "pid"))
     with pytest.raises(ScenarioError) as error:
         controllers(twice)

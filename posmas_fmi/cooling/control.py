@@ -155,12 +155,13 @@ WHAT_IS_PROVED = {
     "integral": "Certificate I where [design] asks for it: the continuous loop contracts and has "
     "no offset. Not proved: sampling, delays, limits of the valve, the fallback. Positivity by "
     "physics.",
-    "integral_ff": "As integral; a feedforward does not change the loop.",
+    "integral_ff": "As integral: what is fed forward does not come back, so the loop is the same.",
     "set_point": "The consensus on the set-point converges (pinned Laplacian, step below one over "
     "the degree). Not proved: the PI loops, coupling through the header.",
     "pi": "Nothing; tuned as in practice.",
     "pi_ff": "Nothing; tuned as in practice.",
     "pinned_pi": "Nothing; lines without a set-point stand still.",
+    "mpc": "Nothing; a reference that knows the header and every measurement at once.",
     "team": "Nothing; the mean of a team is controlled, not its lines.",
 }
 

@@ -219,6 +219,13 @@ class LineParameters:
         kappa = released / (theta_s + released / self.ws)
         return self._position(kappa, h, f"P = {P:g} W, theta_s = {theta_s:g} K, h = {h:g}")
 
+    def nearest(self, P: float, theta_s: float | None = None, h: float = 1.0) -> float:
+        """Return `position`, or the end of the valve's range that comes nearest to it."""
+        try:
+            return self.position(P, theta_s, h)
+        except InputError:
+            return float(P > self.P0)
+
     def _position(self, kappa: float, h: float, case: str) -> float:
         from scipy.optimize import brentq
 

@@ -111,17 +111,9 @@ def return_range(line: LineParameters, loads: tuple[float, float] = LOADS) -> tu
     ends = []
     for load in loads:
         fixed = line.steady(load)[1]
-        held = line.steady(load, _holding(line, load))[1]
+        held = line.steady(load, line.nearest(load))[1]
         ends.append((min(fixed, held), max(fixed, held)))
     return float(ends[0][0]), float(ends[1][1])
-
-
-def _holding(line: LineParameters, load: float) -> float:
-    """Valve position that holds the supply temperature, or the nearest to it."""
-    try:
-        return line.position(load)
-    except InputError:
-        return float(load > line.P0)
 
 
 def sector(

@@ -155,7 +155,7 @@ def simulate_row(
 ) -> RowResult:
     """Co-simulate a row: every line and the header are FMUs.
 
-    The lines start in the steady state of their first load with the valve at its nominal position.
+    The lines start in the steady state of their first load at the operating point's supply.
 
     Parameters
     ----------
@@ -172,7 +172,10 @@ def simulate_row(
         If an FMU fails at the start, or sizes do not fit.
     """
     n, law = row.network.N, row.law
-    values = [line_values(row.line.sized(size * row.line.P0), load) for size, load in _starts(row)]
+    values = [
+        line_values(line, load, line.nearest(load))
+        for line, load in ((row.line.sized(size * row.line.P0), p) for size, p in _starts(row))
+    ]
     drive = _Drive(row)
     specs, wiring = _wire(row, values, drive)
     x = np.array([[v["T_plate"], v["T_return"], v["T_supply"]] for v in values]) - FACILITY

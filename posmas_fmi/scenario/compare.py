@@ -42,10 +42,11 @@ def controllers(scenario: Scenario) -> dict[str, ControlTable]:
     compare = scenario.compare
     assert compare is not None
     from posmas_fmi.cooling.control import CONTROLLERS
+    from posmas_fmi.scenario.cooling import PREDICTIVE
 
     found: dict[str, ControlTable] = {}
     problems = []
-    laws = ("protocol", *(CONTROLLERS if scenario.cooling is not None else ()))
+    laws = ("protocol", *((*CONTROLLERS, PREDICTIVE) if scenario.cooling is not None else ()))
     for k, name in enumerate(compare.controllers):
         place = f"$.compare.controllers[{k}]"
         if name in found:

@@ -17,6 +17,7 @@ from posmas_fmi.cooling.kpi import key_figures
 from posmas_fmi.cooling.law import CoolingLaw, team_network
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.mapping import line_agent, line_texts, valve_mapping
+from posmas_fmi.cooling.mpc import Prediction, PredictiveLaw
 from posmas_fmi.cooling.plant import header_values, line_values
 from posmas_fmi.cosim.law import Law
 from posmas_fmi.cosim.master import Outcome
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from posmas_fmi.scenario.build import Scenario
 
 NOMINAL = LineParameters()
+PREDICTIVE = "mpc"
 FACILITY = "facility"
 HELD_ABOVE_DEW_POINT = 2.0  # K
 RECORDED = (
@@ -147,11 +149,7 @@ def expand(
 def _start(cooling: CoolingTable, size: float, load: float) -> dict[str, float]:
     """Values of the FMU of a line that holds the set-point, or is as near to it as it can be."""
     line = NOMINAL.sized(size * NOMINAL.P0)
-    try:
-        y = line.position(load, cooling.set_point)
-    except InputError:
-        y = float(load > line.P0)
-    return line_values(line, load, y, cooling.facility)
+    return line_values(line, load, line.nearest(load, cooling.set_point), cooling.facility)
 
 
 def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
@@ -277,7 +275,8 @@ def control(table: ControlTable, cooling: CoolingTable, designed: Design, place:
             )
     if table.law not in CONTROLLERS:
         raise InputError(
-            f"expected one of {', '.join(CONTROLLERS)} (got {table.law!r})", f"{place}.law"
+            f"expected one of {', '.join((*CONTROLLERS, PREDICTIVE))} (got {table.law!r})",
+            f"{place}.law",
         )
     try:
         return controller(table.law, **changes | table.parameters)
@@ -304,7 +303,7 @@ def network_of(table: ControlTable, network: Network) -> Network:
 
 def cooling_law(
     table: ControlTable, cooling: CoolingTable, designed: Design, place: str = "$.control"
-) -> CoolingLaw:
+) -> Law:
     """Return the law of ``[control]`` or ``[controllers.NAME]``.
 
     Parameters
@@ -321,6 +320,8 @@ def cooling_law(
         If law or a parameter is not known, or out of range.
     """
     network = designed.network
+    if table.law == PREDICTIVE:
+        return _predictive(table, cooling, network, place)
     return CoolingLaw(
         NOMINAL,
         control(table, cooling, designed, place),
@@ -350,16 +351,38 @@ def proved(table: ControlTable) -> dict[str, Any]:
     }
 
 
+def _predictive(
+    table: ControlTable, cooling: CoolingTable, network: Network, place: str
+) -> PredictiveLaw:
+    if cooling.set_point_step is not None:
+        raise InputError(f"{PREDICTIVE!r} knows one set-point only", f"{place}.law")
+    try:
+        prediction = Prediction(**table.parameters)
+    except TypeError as error:
+        raise InputError(str(error), f"{place}.parameters") from None
+    except InputError as error:
+        raise InputError(error.message, f"{place}.parameters.{error.where}") from None
+    return PredictiveLaw(
+        NOMINAL,
+        network,
+        sizes(cooling, network.N),
+        cooling.shortage,
+        cooling.set_point,
+        prediction,
+        water=cooling.facility,
+    )
+
+
 # ---- what came of it ----------------------------------------------------------------------------
 
 
 def set_points(cooling: CoolingTable, law: Law) -> Callable[[Array], dict[str, Array]]:
     """Return what gives the set-point [K] at some times, as a recorded variable."""
-    own = law if isinstance(law, CoolingLaw) else None
+    constant = NOMINAL.theta_s0 if cooling.set_point is None else cooling.set_point
 
     def at(times: Array) -> dict[str, Array]:
-        above = [NOMINAL.theta_s0 if own is None else own.set_point(t) for t in times]
-        return {"set_point": cooling.facility + np.array(above)}
+        above = [law.set_point(t) for t in times] if isinstance(law, CoolingLaw) else constant
+        return {"set_point": cooling.facility + np.broadcast_to(above, times.shape)}
 
     return at
 
@@ -399,6 +422,8 @@ def judge(
     table = _recorded(results)
     if len(table["time"]) < 2:
         return
+    # what is centralised: a line's readings to the centre and a command back
+    messages = 2 * designed.network.N * outcome.steps if name == PREDICTIVE else outcome.messages
     alone = name in CONTROLLERS and CONTROLLERS[name].law in ("fixed", "local")
     if name not in ("protocol", "proportional"):
         for row in summary.get("coverage", []):
@@ -411,7 +436,7 @@ def judge(
         table["valve_position"],
         table["case_temperature"],
         None if cooling.water_class is None else class_limit(cooling.water_class),
-        0 if alone else outcome.messages,
+        0 if alone else messages,
         table["primary_flow"],
         table["header"],
     )
