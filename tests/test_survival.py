@@ -217,6 +217,14 @@ def test_a_worker_that_is_killed_from_outside(fmu: Path) -> None:
     assert outcome.incidents[0].signal == signal.SIGKILL
 
 
+def test_a_request_may_be_larger_than_the_socket_holds(fmu: Path) -> None:
+    with faulty_plant(fmu, {}, isolation()) as plant:
+        worker = plant._instances[0].worker
+        again = {"do": "load", "path": str(fmu), "unpacked": "", "structure": {}}
+        worker.request(again, bytes(4_000_000))
+        assert worker.alive
+
+
 def test_instances_that_want_a_process_each_get_one(tmp_path_factory: Any) -> None:
     once = faulty_fmu(tmp_path_factory.mktemp("once"), once=True)
     with faulty_plant(once, {}, isolation()) as plant:

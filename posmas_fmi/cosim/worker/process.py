@@ -187,12 +187,13 @@ class WorkerProcess:
         """
         if not self.alive:
             raise WorkerLost(self.death())
+        # told before it is sent: what is larger than the socket holds waits for the worker
+        self._library.remote_ask(ctypes.addressof(self.entry))
         try:
             self._link.settimeout(self._patience.start)
             frames.send(self._link, content, data, handles)
         except OSError:
             self._lose(DIED)
-        self._library.remote_ask(ctypes.addressof(self.entry))
         step = content["do"] == "replay" or content.get("method") in ("do_step", "read", "write")
         self._await(self._patience.step if step else self._patience.start)
         answer = frames.receive(self._link)
