@@ -347,13 +347,13 @@ def libcosim(setting: Setting) -> float:
 
 def ecos(setting: Setting) -> float:
     try:
-        from ecospy import EcosSimulationStructure
+        from ecospy import EcosSimulation, EcosSimulationStructure
     except (ImportError, OSError) as error:
         raise Skip(str(error)) from error
     structure = EcosSimulationStructure()
     for k in range(setting.n):
         structure.add_model(f"a{k}", str(agent_fmu_2(setting)))
-    with structure.create_simulation(H) as simulation:
+    with EcosSimulation(H, structure=structure) as simulation:
         simulation.init()
         return per_step(setting, lambda: simulation.step(setting.steps))
 
