@@ -20,7 +20,7 @@ from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.scenario.build import shipped_scenarios
 from posmas_fmi.scenario.compare import controllers
-from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law
+from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law, proved
 from posmas_fmi.scenario.job import (
     extras,
     law_network,
@@ -194,6 +194,16 @@ def test_unknown_laws_and_parameters_are_named(row, designed) -> None:
     assert [place for place, _ in error.value.problems] == [
         "$.compare.controllers[1]", "$.compare.controllers[2]", "$.compare.practice",
     ]  # fmt: skip
+
+
+def test_only_the_law_with_the_gains_of_the_design_has_its_certificate(designed) -> None:
+    assert "certified" not in proved(ControlTable("proportional"), designed)
+    own = ControlTable("proportional", parameters={"K": [0.0, -1.0, -1.0]})
+    assert proved(own, designed)["certified"] == "no"
+    assert proved(ControlTable("integral"), designed)["certified"] == "no"
+    with_integral = attrs.evolve(designed, K_q=np.array([[-70.0]]))
+    assert "certified" not in proved(ControlTable("integral"), with_integral)
+    assert proved(ControlTable("proportional"), with_integral)["certified"] == "no"
 
 
 def test_the_law_says_what_is_measured(row) -> None:

@@ -331,13 +331,17 @@ def cooling_law(
     )
 
 
-def proved(table: ControlTable) -> dict[str, Any]:
+def proved(table: ControlTable, designed: Design) -> dict[str, Any]:
     """Return what design.json says instead of the design where a law is not the protocol (6).
 
-    The certificate of the design is about (6) with its gains, which only the proportional law is.
+    The certificate of the design is about (6) with its gains, which only the proportional law is,
+    or, of a design with an integral, about the integral laws. Other gains than the design's have
+    no certificate.
     """
     note = WHAT_IS_PROVED.get(table.law, "")
-    if table.law in ("protocol", "proportional"):
+    certified = ("integral", "integral_ff") if designed.K_q is not None else ("proportional",)
+    own = {"K", "E", "K_q"} & set(table.parameters)
+    if table.law == "protocol" or (table.law in certified and not own):
         return {"notes": [note]} if note else {}
     return {
         "certified": "no",
@@ -347,7 +351,7 @@ def proved(table: ControlTable) -> dict[str, Any]:
         "observer_rate": None,
         "rate_perron": None,
         "positive": False,
-        "notes": [f"The gains are those of the design; the law is {table.law!r}. {note}"],
+        "notes": [f"The certificate of the design is not about this law, {table.law!r}. {note}"],
     }
 
 

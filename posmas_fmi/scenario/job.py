@@ -194,7 +194,7 @@ def run_designed(
     if scenario.cooling is not None:
         from posmas_fmi.scenario.cooling import proved
 
-        facts |= proved(scenario.control)
+        facts |= proved(scenario.control, designed)
     write_json(folder / "design.json", facts)
     write_json(folder / "manifest.json", told)
 
