@@ -58,6 +58,61 @@ def test_a_stuck_sensor_deceives_its_observer_from_then_on(tmp_path: Path, plain
     assert fault["covered"].startswith("not covered")
 
 
+def test_a_noisy_sensor_is_noisy_for_its_time(tmp_path: Path, plain: Any) -> None:
+    noisy = '[[fault]]\nkind = "sensor noise"\nat = 0.2\nuntil = 0.6\nagents = [3]\nvalue = 0.05\n'
+    _, data = result(tmp_path, noisy)
+    usual, begin = plain[1], steps(data, 0.2)
+    np.testing.assert_array_equal(data["xhat"][: begin + 1], usual["xhat"][: begin + 1])
+    moved = np.abs(data["xhat"][:, 2] - usual["xhat"][:, 2]).max(axis=1).values
+    assert moved[begin + 1 : begin + 60].max() > 1e-3
+    for which in ("c", "numpy"):  # the same noise in both loops
+        text = Path(scenario(tmp_path, noisy))
+        text.write_text(
+            text.read_text().replace("[scenario]", f'[scenario]\nengine = "{which}"', 1)
+        )
+        run(load(str(text), until=1.0), tmp_path / which, report=False)
+    both = [xarray.load_dataset(tmp_path / w / "results.nc")["xhat"] for w in ("c", "numpy")]
+    np.testing.assert_allclose(both[0], both[1], rtol=0, atol=1e-12)
+
+
+CRASH = """
+[[fault]]
+kind = "FMU crash"
+at = 0.5
+agents = [3]
+"""
+
+
+@pytest.mark.parametrize("engine", ["c", "numpy"])
+@pytest.mark.parametrize("then", ["stop", "freeze", "restart"])
+def test_an_fmu_crashes_when_it_is_told_to(tmp_path: Path, then: str, engine: str) -> None:
+    """Its process is really killed; what the rest does is [plant] on_failure."""
+    path = Path(scenario(tmp_path, CRASH))
+    text = path.read_text().replace("[scenario]", f'[scenario]\nengine = "{engine}"', 1)
+    isolated = f'[plant]\nisolation = "process"\non_failure = "{then}"\nworkers = 2'
+    path.write_text(text.replace("[plant]", isolated, 1))
+    made = run(load(str(path), until=1.0), tmp_path / "out", report=False)
+    (incident,) = made.summary["incidents"]
+    assert incident["agent"] == "3"
+    assert incident["time"] == pytest.approx(0.5, abs=0.0051)
+    assert "KILL" in incident["verdict"]
+    with xarray.open_dataset(tmp_path / "out" / "results.nc") as data:
+        x, times = data["x"].values, data["time"].values
+    if then == "stop":
+        assert made.summary["verdict"] == "failed"
+        assert times[-1] == pytest.approx(0.5, abs=0.0051)
+        return
+    assert times[-1] == 1.0
+    moves = np.abs(np.diff(x[times > 0.52], axis=0)).max(axis=(0, 2))
+    assert (moves[[0, 1, 3]] > 0).all()
+    assert (moves[2] > 0) == (then == "restart")
+
+
+def test_an_fmu_in_this_process_is_not_killed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='isolation = "process"'):
+        result(tmp_path, CRASH)
+
+
 def test_a_stuck_actuator_keeps_the_input_of_the_plant(tmp_path: Path, plain: Any) -> None:
     _, data = result(tmp_path, '[[fault]]\nkind = "actuator stuck"\nat = 0.1\n')
     usual, k = plain[1], steps(data, 0.1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from posmas_fmi.expression import Array
 
-What = Literal["sensor_gain", "sensor_offset", "actuator_gain", "loss", "arc_off"]
+What = Literal["sensor_gain", "sensor_offset", "sensor_noise", "actuator_gain", "loss", "arc_off"]
 
 
 @attrs.frozen(eq=False)
@@ -21,7 +21,8 @@ class Episode:
     ----------
     what : str
         ``sensor_gain``: 1 follows, 0 shows its last value; ``sensor_offset``: added to what is
-        measured; ``actuator_gain``: 1 follows the command, 0 stays, between: goes that part of the
+        measured; ``sensor_noise``: standard deviation of noise that is added besides;
+        ``actuator_gain``: 1 follows the command, 0 stays, between: goes that part of the
         way in each step; ``loss``: probability that a message is lost; ``arc_off``: 1 takes an arc
         out of the digraph.
     index : tuple or array
@@ -47,7 +48,7 @@ class Conditions:
 
     Attributes
     ----------
-    sensor_gain, sensor_offset : (N, measured) array
+    sensor_gain, sensor_offset, sensor_noise : (N, measured) array
     actuator_gain : (N, p) array
     loss : (arcs,) array
         Arcs between agents, then those from the leader to the pinned.
@@ -57,6 +58,7 @@ class Conditions:
 
     sensor_gain: Array
     sensor_offset: Array
+    sensor_noise: Array
     actuator_gain: Array
     loss: Array
     arc_off: Array
@@ -104,6 +106,7 @@ class Timeline:
         """Conditions that hold at communication point k; of two episodes the later one counts."""
         conditions = Conditions(
             np.ones((self.agents, self.measured)),
+            np.zeros((self.agents, self.measured)),
             np.zeros((self.agents, self.measured)),
             np.ones((self.agents, self.inputs)),
             self.loss.copy(),

@@ -414,7 +414,7 @@ class Engine:
             shape = (system.network.N, system.measured)
             resolution = np.zeros(shape) if sensors is None else sensors.resolution
             self._point("sensor_resolution", resolution)
-        self._noise = sensors if sensors is not None and sensors.noise.any() else None
+        self._noise = system.noisy
 
     def _measures_others(self) -> bool:
         """Whether agents measure readings of other instances."""
@@ -449,6 +449,9 @@ class Engine:
         jump = self._system.leader_at(k)
         if jump is not None:
             self._memory[k % 2, -1] = self._law.lead(jump)
+        for point, number in self._system.crashes:
+            if point == k:
+                self._plant.crash(number)
 
     def _allocate(self) -> None:
         system, e, fmus, law = self._system, self._e, self._plant.fmus, self._law
@@ -502,7 +505,7 @@ class Engine:
         row = 8 * sum(int(np.prod(shape)) for shape in wanted.values()) + 8
         other = 0 if self._arrivals is None else 4 * self._e.all_arcs
         other += 8 * self._e.drives
-        other += 0 if self._noise is None else 8 * n * system.measured
+        other += 8 * n * system.measured if self._noise else 0
         self._room = int(max(1, min(BLOCK // (row + other), system.clock.steps + 1)))
         self._rows: dict[str, Array] = {}
         if wanted:
@@ -572,8 +575,8 @@ class Engine:
         e = self._e
         if e.drives:
             self._point("drive", self._system.wiring.drive.rows(begin, end + 1))
-        if self._noise is not None:
-            self._point("noise", self._noise.noise_at(begin, end + 1, self._system.seed))
+        if self._noise:
+            self._point("noise", self._system.noise_at(begin, end + 1))
         if self._arrivals is not None and end > begin:
             loss = self._conditions.loss if self._draws_loss else None
             self._point("arrivals", self._arrivals.draw(begin, end, loss), np.int32)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import os
+import signal
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
@@ -55,6 +57,8 @@ class PlantSpec:
         What is read after it: y of an agent, its x where shown, then what else is used.
     tolerance : float, optional
         Relative, for the solver inside the FMU; its own default if left out.
+    alone : bool
+        Whether it shares its worker process with no other, if it has one.
     """
 
     fmu: Path
@@ -63,6 +67,7 @@ class PlantSpec:
     inputs: PortMap = attrs.field(default=PortMap.plain(()))
     readings: PortMap = attrs.field(default=PortMap.plain(()))
     tolerance: float | None = None
+    alone: bool = False
 
 
 class FmuPlant:
@@ -261,6 +266,23 @@ class FmuPlant:
         if self._remote is not None:
             self._remote.checkpoint()
 
+    def crash(self, number: int) -> None:
+        """Kill the process of an instance, as a fault.
+
+        Raises
+        ------
+        InputError
+            If the instance is in this process.
+        """
+        instance = self._instances[number]
+        if not isinstance(instance, RemoteInstance):
+            raise InputError(
+                f"{self.names[number]} runs in this process; an FMU that is to crash needs "
+                'isolation = "process"',
+                "$.plant.isolation",
+            )
+        os.kill(instance.worker.pid, signal.SIGKILL)
+
     def save(self, which: Whole) -> Any:
         """Keep the states of some instances.
 
@@ -369,7 +391,7 @@ def _start_all(
     there: dict[WorkerProcess, list[tuple[RemoteInstance, PlantSpec]]] = {}
     for file, spec in zip(files, specs, strict=True):
         if isinstance(file, RemoteFile):
-            instance: FmuInstance = file.prepare(spec.name)
+            instance: FmuInstance = file.prepare(spec.name, spec.alone)
             assert isinstance(instance, RemoteInstance)
             there.setdefault(instance.worker, []).append((instance, spec))
         else:

@@ -78,6 +78,8 @@ class System:
         What is otherwise for a time.
     leader_changes : tuple of (int, (m,) array)
         Communication points at which the leader jumps to another state.
+    crashes : tuple of (int, int)
+        Communication points at which the process of an instance, by its number, is killed.
     every : (instances,) array of int, optional
         Period of each instance and its controller, in communication steps; 1 by default.
     stages : tuple of arrays of int, optional
@@ -99,6 +101,7 @@ class System:
     sensors: Sensors | None = None
     episodes: tuple[Episode, ...] = ()
     leader_changes: tuple[tuple[int, Array], ...] = ()
+    crashes: tuple[tuple[int, int], ...] = ()
     every: Whole = attrs.field()
     stages: tuple[Whole, ...] = attrs.field()
     iteration: Iteration | None = None
@@ -139,8 +142,29 @@ class System:
 
     def next_change(self, k: int) -> int:
         """First communication point after k at which conditions or the leader change."""
-        jumps = (point for point, _ in self.leader_changes if point > k)
+        jumps = (point for point, _ in (*self.leader_changes, *self.crashes) if point > k)
         return min((self.timeline.next_change(k), *jumps))
+
+    @property
+    def noisy(self) -> bool:
+        """Whether what is measured is ever noisy."""
+        always = self.sensors is not None and bool(self.sensors.noise.any())
+        return always or self.timeline.has("sensor_noise")
+
+    def noise_at(self, begin: int, end: int) -> Array:
+        """Noise of the sensors at the communication points begin … end - 1, (…, N, measured)."""
+        shape, timeline = (self.network.N, self.measured), self.timeline
+        zero = np.zeros(shape)
+        sensors = Sensors(zero, zero) if self.sensors is None else self.sensors
+        if not timeline.has("sensor_noise"):
+            return sensors.noise_at(begin, end, self.seed)
+        rows = [
+            attrs.evolve(sensors, noise=sensors.noise + timeline.at(k).sensor_noise).noise_at(
+                k, k + 1, self.seed
+            )
+            for k in range(begin, end)
+        ]
+        return np.concatenate(rows)
 
     def leader_at(self, k: int) -> Array | None:
         """State to which the leader jumps at communication point k, if it does."""
@@ -336,6 +360,7 @@ class Run:
         self.min_time = np.zeros(N)
         self.seen: tuple[Array, Array, Array] | None = None  # x, the estimates and s
         self.limit = np.inf
+        self.noisy = system.noisy
         self.replay_noise = 0.0  # of a reading, relative to its size or 1
 
     def run(self) -> Outcome:
@@ -416,6 +441,9 @@ class Run:
             self.change = self.timeline.next_change(k)
         if k in self.jumps:
             state.leader = system.law.lead(self.jumps[k])
+        for point, number in system.crashes:
+            if point == k:
+                self.plant.crash(number)
 
     def _weights(self) -> Weights:
         weights = self.system.weights_with(self.conditions.arc_off)
@@ -432,8 +460,9 @@ class Run:
             value = np.concatenate([value, rest], axis=1)
         if not self.exact_sensors:
             value = value + self.conditions.sensor_offset
+        if self.noisy:
+            value = value + system.noise_at(k, k + 1)[0]
         if sensors is not None:
-            value = value + sensors.noise_at(k, k + 1, system.seed)[0]
             value = rounded(value, sensors.resolution)
         if k > 0 and not self.exact_sensors:
             gain = self.conditions.sensor_gain

@@ -64,6 +64,9 @@ class Plant(Interface):
     def checkpoint(self) -> None:
         """Save states for later, if it is time; called between steps."""
 
+    def crash(self, number: int) -> None:
+        """Kill the process of an instance, as a fault."""
+
     def close(self) -> None:
         """Release what the plant holds."""
 
@@ -97,6 +100,10 @@ class _Agents:
 
     def checkpoint(self) -> None:
         """Nothing to save."""
+
+    def crash(self, number: int) -> None:
+        """Refuse: there is no process to kill."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Nothing to release."""

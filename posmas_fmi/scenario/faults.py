@@ -18,12 +18,16 @@ KINDS = {
     "sensor stuck": "shows its last value; not covered: the observer follows a false output",
     "sensor bias": "an added value; not covered, but bounded: certificate G gives the band of a "
     "bounded disturbance E·bias",
+    "sensor noise": "white noise is added; not covered, but bounded noise is a disturbance for "
+    "certificate G",
     "actuator stuck": "keeps its last position; not covered",
     "actuator slow": "goes a part of the way in each step; not covered",
     "messages lost": "the last message is held; covered by certificate D as a delay of at most "
     "the episode, if what is proved covers delays",
     "leader lost": "the last state heard is held; covered by certificate D as a delay, so agents "
     "agree on what was heard last while the leader may go on",
+    "FMU crash": "the process of the FMU is killed, what follows is [plant] on_failure; not "
+    "covered: a frozen agent is heard with its last message and follows nobody",
     "arc off": "the arc is not in the digraph; covered as long as the digraph without it is "
     "certified by itself and changes are rare",
 }
@@ -54,6 +58,18 @@ def make_episodes(
     )
 
 
+def make_crashes(
+    faults: list[FaultTable], network: Network, clock: Clock
+) -> tuple[tuple[int, int], ...]:
+    """Return communication points and numbers of the agents whose FMUs crash there."""
+    return tuple(
+        (steps_of(fault.at, clock.h), number)
+        for k, fault in enumerate(faults)
+        if fault.kind == "FMU crash"
+        for number in _agents(fault, network, f"$.fault[{k}]")
+    )
+
+
 def _episodes(
     fault: FaultTable, network: Network, agent: Agent, clock: Clock, place: str
 ) -> list[Episode]:
@@ -62,6 +78,9 @@ def _episodes(
         raise InputError(f"expected a time >= 0 s (got {fault.at:g})", f"{place}.at")
     if end <= begin:
         raise InputError(f"expected a time after {fault.at:g} s", f"{place}.until")
+    if fault.kind == "FMU crash":
+        _agents(fault, network, place)
+        return []
     if fault.kind in ("messages lost", "leader lost", "arc off"):
         arcs = _arcs(fault, network, place)
         if fault.kind == "arc off":
@@ -70,6 +89,9 @@ def _episodes(
     agents = _agents(fault, network, place)
     if fault.kind.startswith("sensor"):
         ports = _ports(fault, agent.q, "outputs", place)
+        if fault.kind == "sensor noise":
+            deviation = _value(fault, place, None, 0.0)
+            return [Episode("sensor_noise", np.ix_(agents, ports), deviation, begin, end)]
         if fault.kind == "sensor stuck":
             return [Episode("sensor_gain", np.ix_(agents, ports), 0.0, begin, end)]
         bias = _value(fault, place, None)

@@ -31,7 +31,7 @@ from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.coverage import coverage
-from posmas_fmi.scenario.faults import describe, make_episodes
+from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
 from posmas_fmi.scenario.resume import Beginning, branched, resumed, snapshots
 from posmas_fmi.scenario.schedule import make_schedule
@@ -410,6 +410,7 @@ def make_system(scenario: Scenario, designed: Design, instances: Instances) -> S
         wiring=instances.wiring,
         episodes=make_episodes(list(scenario.faults), network, scenario.agent, scenario.clock),
         leader_changes=scenario.jumps,
+        crashes=make_crashes(list(scenario.faults), network, scenario.clock),
         sensors=_sensors(scenario.sensors, len(law.extras)),
         every=instances.every,
         **_coupling(scenario),

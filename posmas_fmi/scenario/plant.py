@@ -19,6 +19,7 @@ from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
 from posmas_fmi.scenario.build import Scenario
+from posmas_fmi.scenario.faults import make_crashes
 from posmas_fmi.scenario.tables import Override, Port
 from posmas_fmi.scenario.wire import Instance, Recorded, Wires
 
@@ -157,8 +158,13 @@ def make_instances(
     wiring, recorded = wires.wiring(
         plant.record, [c.record for c in scenario.components], scenario.signals
     )
+    faults = list(scenario.faults)
+    crashing = {k for _, k in make_crashes(faults, scenario.network, scenario.clock)}
     return Instances(
-        tuple(one.spec() for one in (*agents, *components)),
+        tuple(
+            attrs.evolve(one.spec(), alone=k in crashing)
+            for k, one in enumerate((*agents, *components))
+        ),
         wiring,
         recorded,
         shows_states,

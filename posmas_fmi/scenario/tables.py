@@ -389,8 +389,8 @@ class FaultTable:
     Attributes
     ----------
     kind : str
-        One of ``sensor stuck``, ``sensor bias``, ``actuator stuck``, ``actuator slow``,
-        ``messages lost``, ``leader lost``, ``arc off``.
+        One of ``sensor stuck``, ``sensor bias``, ``sensor noise``, ``actuator stuck``,
+        ``actuator slow``, ``messages lost``, ``leader lost``, ``arc off``, ``FMU crash``.
     at : float
         When it begins [s].
     until : float, optional
@@ -402,18 +402,21 @@ class FaultTable:
     arcs : list of [from, to]
         For messages and arcs; 0 is the leader; default all.
     value : float, optional
-        The bias; the part of the way that a slow actuator goes in each step (0 to 1); the
+        The bias; the standard deviation of noise; the part of the way that a slow actuator goes
+        in each step (0 to 1); the
         probability of loss (default 1).
     """
 
     kind: Literal[
         "sensor stuck",
         "sensor bias",
+        "sensor noise",
         "actuator stuck",
         "actuator slow",
         "messages lost",
         "leader lost",
         "arc off",
+        "FMU crash",
     ]
     at: float
     until: float | None = None

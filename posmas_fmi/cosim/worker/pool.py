@@ -86,9 +86,9 @@ class WorkerPool:
         self._all.append(worker)
         return worker
 
-    def place(self, file: RemoteFile) -> WorkerProcess:
-        """Return the process for the next instance of a file."""
-        if file.only_once:
+    def place(self, file: RemoteFile, alone: bool = False) -> WorkerProcess:
+        """Return the process for the next instance of a file; if `alone`, one of its own."""
+        if file.only_once or alone:
             return self.start()
         while len(self._shared) < self._most:  # all at once: they start side by side
             self._shared.append(self.start())

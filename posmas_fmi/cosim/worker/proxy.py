@@ -21,7 +21,7 @@ from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.state import FmuState
 from posmas_fmi.fmu.variables import Ports
 
-Place = Callable[["RemoteFile"], WorkerProcess]
+Place = Callable[["RemoteFile", bool], WorkerProcess]
 
 
 def built_here(path: Path) -> bool:
@@ -87,11 +87,11 @@ class RemoteFile(FmuFile):
         instance.make(instance.worker)
         return instance
 
-    def prepare(self, name: str) -> RemoteInstance:
+    def prepare(self, name: str, alone: bool = False) -> RemoteInstance:
         """Return an instance that is to be made in its worker process: see `make`."""
         if self.closed:
             raise FmuError("the file is closed", str(self.path))
-        return RemoteInstance(self, name, self._place(self))
+        return RemoteInstance(self, name, self._place(self, alone))
 
     def address(self, function: str) -> int:
         """Return 0: there is nothing here to be called."""
