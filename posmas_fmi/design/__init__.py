@@ -5,11 +5,12 @@ from __future__ import annotations
 from importlib import import_module
 
 import attrs
+import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.design.result import Baseline, Design
 from posmas_fmi.design.settings import METHODS, DesignSettings, Method
-from posmas_fmi.errors import NotBuiltError
+from posmas_fmi.errors import DesignError, NotBuiltError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
@@ -23,6 +24,9 @@ _MODULES: dict[Method, str] = {
     "paper-2": "paper",
     "gains": "gains",
 }
+
+
+LARGEST = 1e12  # of an entry of A, H, B or C times the period: beyond it nothing can be computed
 
 
 def design(
@@ -50,7 +54,8 @@ def design(
     NetworkError
         If the leader does not reach every agent.
     DesignError
-        If the method finds no gains, saying what clashes, where, and what would help.
+        If the method finds no gains, saying what clashes, where, and what would help; or if a
+        matrix has an entry with which nothing can be computed.
 
     Examples
     --------
@@ -62,6 +67,8 @@ def design(
     >>> made.certificate.certified, made.certificate.positive
     ('yes', True)
     """
+    if settings.method != "gains":  # given gains are judged whatever they are for
+        _check_sizes(agent, period)
     try:
         method = import_module(f"posmas_fmi.design.{_MODULES[settings.method]}")
     except ModuleNotFoundError as error:
@@ -72,6 +79,20 @@ def design(
         ) from None
     found: Design = method.design(agent, network, settings, period)
     return found
+
+
+def _check_sizes(agent: Agent, period: float | None) -> None:
+    """Name an entry that is far beyond what the period, or doubles, can take."""
+    for name in "AHBC":
+        entries = np.abs(getattr(agent, name)) * (period or 1.0)
+        if entries.max(initial=0.0) > LARGEST:
+            i, j = (int(k) for k in np.unravel_index(entries.argmax(), entries.shape))
+            raise DesignError(
+                f"expected entries up to {LARGEST:g}, counted per control period (got "
+                f"{getattr(agent, name)[i, j]:g}): correct it, or take other units or a shorter "
+                "period",
+                f"$.agent.{name}[{i}][{j}]",
+            )
 
 
 def certify(
