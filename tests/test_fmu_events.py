@@ -15,6 +15,7 @@ from test_fmu_instance import described
 
 from posmas_fmi import load, run
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import FmuCallError, FmuError
 from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.archive import read_entry
@@ -106,6 +107,25 @@ def test_going_back_takes_the_clocks_along(sampler: EventInstance) -> None:
         found.append([sampler.get(name) for name in ("y", "x", "jumps", "alarms")])
     assert found[0] == found[1]
     assert found[0][0] == 2.0 + 10.0 + 2 * 5.0 * 4  # ticks at 0.2, 0.4, 0.6 and 0.8
+
+
+def test_a_serialised_state_takes_the_clocks_along(sampler: EventInstance) -> None:
+    """Clocks, waiting inputs and the alarm that is set go on in a fresh instance."""
+    u, level = (sampler.file.ports((name,)) for name in ("u", "level"))
+    sampler.write(level, [3])
+    sampler.write(u, [1.0])
+    sampler.do_step(0.0, 0.6)  # the alarm is set at 0.55 and rings at 0.7
+    sampler.write(u, [5.0])  # waits for the tick at 0.6
+    data = sampler.serialise()
+    with sampler.file.instantiate("fresh") as fresh:
+        fresh.initialise({"gain": 1.0}, stop=10.0)
+        fresh.deserialise(data, 0.6)
+        found = []
+        for one in (sampler, fresh):
+            one.do_step(0.6, 0.3)
+            found.append([one.get(name) for name in ("y", "x", "jumps", "alarms", "level")])
+    assert found[0] == found[1]
+    assert found[0][3:] == [1, 3]
 
 
 def test_a_tick_between_points_of_an_fmu_with_equal_steps(clocked: Path, tmp_path: Path) -> None:
@@ -206,6 +226,30 @@ def test_a_model_goes_back(tmp_path: Path) -> None:
             plant.read(which, 1.0, readings)
             found.append(readings[0])
     assert found[0] == found[1] > 300.0
+
+
+@pytest.mark.parametrize("isolation", ["none", "process"])
+@pytest.mark.parametrize("kind", ["clocked", "model"])
+def test_a_run_with_them_goes_on_from_a_snapshot(
+    clocked: Path, tmp_path: Path, kind: str, isolation: str
+) -> None:
+    """What the FMU cannot know is in the snapshot: bit for bit the same, without doing it again."""
+    path = clocked if kind == "clocked" else only_me(tank_fmu(tmp_path, 3), tmp_path / "me.fmu")
+    ports = ('"u"', '"y"') if kind == "clocked" else ('"power"', '"temperature"')
+    more = f'isolation = "{isolation}"'
+    text = Path(one_fmu(tmp_path, path, *ports, more, gain=-0.05))
+    text.write_text(text.read_text().replace("[scenario]", "[scenario]\nsnapshot = 0.3", 1))
+    run(load(text), tmp_path / "whole", report=False)
+    kept = sorted((tmp_path / "whole" / "snapshots").glob("*.npz"))
+    assert all(Snapshot.load(one).fmus is not None for one in kept)
+    with xarray.open_dataset(tmp_path / "whole" / "results.nc") as data:
+        expected = data.load()
+    for begin in (3, 6):
+        branch = (tmp_path / "whole", begin / 10)
+        run(load(text), tmp_path / f"from-{begin}", report=False, branch=branch)
+        with xarray.open_dataset(tmp_path / f"from-{begin}" / "results.nc") as data:
+            for name in ("time", "y", "u", "xhat"):
+                np.testing.assert_array_equal(data[name].values, expected[name].values[begin:])
 
 
 def test_what_is_scheduled_only_is_not_run(tmp_path: Path) -> None:

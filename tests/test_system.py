@@ -9,13 +9,14 @@ import attrs
 import numpy as np
 import pytest
 from test_engine import assert_alike
+from test_fmu_instance import described
 
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.conditions import NEVER, Episode, Sensors
-from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, Outcome, System
 from posmas_fmi.cosim.wiring import Extra, Term, Wiring, column
@@ -305,13 +306,13 @@ def pair(coupling: str) -> System:
 PAIR_H = 0.1
 
 
-def run_pair(coupling: str, fmu: Path) -> np.ndarray:
+def run_pair(coupling: str, fmu: Path, isolation: str = "none") -> np.ndarray:
     rows = []
     specs = [
         PlantSpec(fmu, {"x": 2.0}, "a", PortMap.plain(("u", "d")), PortMap.plain(("y[1]", "x"))),
         PlantSpec(fmu, {"x": 0.0}, "b", PortMap.plain(("u", "d")), PortMap.plain(("y[1]",))),
     ]
-    with FmuPlant(specs, True, 1e9) as plants:
+    with FmuPlant(specs, True, 1e9, Isolation(isolation)) as plants:
         definition = pair(coupling)
         choice = engine.choose(definition.law, "auto", engine.unfit(definition))
         assert choice.engine == ("c" if coupling == "jacobi" else "numpy")
@@ -341,6 +342,17 @@ def by_hand(coupling: str) -> np.ndarray:
 @pytest.mark.parametrize("coupling", ["jacobi", "gauss-seidel", "iterate"])
 def test_a_coupled_pair_against_its_recursion(coupling: str, fmu: Path) -> None:
     np.testing.assert_allclose(run_pair(coupling, fmu), by_hand(coupling), atol=1e-6)
+
+
+@pytest.mark.parametrize("serialises", [True, False])
+def test_steps_are_repeated_in_worker_processes(
+    fmu: Path, tmp_path: Path, serialises: bool
+) -> None:
+    """Also of FMUs whose states cannot leave the process."""
+    flag = b'canSerializeFMUState="true"'
+    one = fmu if serialises else described(fmu, tmp_path / "one.fmu", flag, b"")
+    expected = run_pair("iterate", fmu)
+    np.testing.assert_array_equal(run_pair("iterate", one, "process"), expected)
 
 
 def test_a_coupled_pair_against_its_analytic_solution(

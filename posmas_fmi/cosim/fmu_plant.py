@@ -301,10 +301,8 @@ class FmuPlant:
     def serialise(self) -> tuple[bytes, ...] | None:
         """Return the states of all instances as bytes; None if an FMU cannot give its own."""
         for file in dict.fromkeys(instance.file for instance in self._instances):
-            interface = file.description.coSimulation
-            if file.kind != "Co-Simulation" or not (
-                interface.canGetAndSetFMUstate and interface.canSerializeFMUstate
-            ):
+            interface = file.about.interface
+            if not (interface.canGetAndSetFMUstate and interface.canSerializeFMUstate):
                 return None
         try:
             return tuple(instance.serialise() for instance in self._instances)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +17,6 @@ from posmas_fmi.fmu.events import settle
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.period import allows_steps_of_different_length
-from posmas_fmi.fmu.state import FmuState
 from posmas_fmi.fmu.variables import REAL, Ports
 
 _MOST_EVENTS = 100_000  # in one step
@@ -252,18 +252,23 @@ class EventInstance(FmuInstance):
 
     # ---- state ----------------------------------------------------------------------------------
 
-    def get_state(self) -> FmuState:
-        """Save the whole state of the instance."""
-        state = super().get_state()
-        kept = (self._ticks, self._tick_at, self._interval, self._waiting, self._held)
-        state.beside = (self.next_event, *(dict(one) for one in kept))
-        return state
+    def _beside(self) -> dict[str, Any]:
+        clocks = [
+            [self._ticks[clock], self._tick_at[clock], self._interval.get(clock)]
+            for clock in self.file.clocks
+        ]
+        return {
+            "next_event": self.next_event,
+            "clocks": clocks,
+            "waiting": dict(self._waiting),
+            "held": dict(self._held),
+        }
 
-    def set_state(self, state: FmuState) -> None:
-        """Go back to a state saved from this instance."""
-        super().set_state(state)
-        if state.beside is not None:
-            self.next_event, *kept = state.beside
-            ticks, tick_at, interval, waiting, held = (dict(one) for one in kept)
-            self._ticks, self._tick_at, self._interval = ticks, tick_at, interval
-            self._waiting, self._held = waiting, held
+    def _set_beside(self, kept: dict[str, Any]) -> None:
+        self.next_event = kept["next_event"]
+        self._waiting, self._held = dict(kept["waiting"]), dict(kept["held"])
+        self._interval = {}
+        for clock, (ticks, at, interval) in zip(self.file.clocks, kept["clocks"], strict=True):
+            self._ticks[clock], self._tick_at[clock] = ticks, at
+            if interval is not None:
+                self._interval[clock] = interval

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from posmas_fmi.errors import FmuCallError, FmuError
 from posmas_fmi.fmu.callbacks import said
 from posmas_fmi.fmu.live import free_instance
-from posmas_fmi.fmu.state import FmuState
+from posmas_fmi.fmu.state import FmuState, joined, parted
 from posmas_fmi.fmu.variables import WHOLE, Group, Ports, Variable, pointer
 
 if TYPE_CHECKING:
@@ -433,12 +433,21 @@ class FmuInstance:
         """Save the whole state of the instance."""
         handle = ctypes.c_void_p()
         self.call(f"Get{self._state}", ctypes.byref(handle))
-        return FmuState(self, handle, self.time)
+        return FmuState(self, handle, self.time, self._beside())
 
     def set_state(self, state: FmuState) -> None:
         """Go back to a state saved from this instance."""
         self.call(f"Set{self._state}", state.handle)
         self.time = state.time
+        if state.beside:
+            self._set_beside(state.beside)
+
+    def _beside(self) -> dict[str, Any]:
+        """Return what is kept here and not in the FMU, as JSON has it; empty for nothing."""
+        return {}
+
+    def _set_beside(self, kept: dict[str, Any]) -> None:
+        """Go back to what `_beside` returned."""
 
     def serialise(self) -> bytes:
         """Return the whole state as bytes, which `deserialise` takes, also in another process."""
@@ -447,7 +456,7 @@ class FmuInstance:
             self.call(f"Serialized{self._state}Size", state.handle, ctypes.byref(size))
             buffer = ctypes.create_string_buffer(size.value)
             self.call(f"Serialize{self._state}", state.handle, self._bytes(buffer), size.value)
-            return buffer.raw
+            return joined(buffer.raw, state.beside)
 
     def deserialise(self, data: bytes, time: float) -> None:
         """Go to a serialised state.
@@ -460,10 +469,11 @@ class FmuInstance:
             The instance's time then [s]; the standard has no way to ask for it.
         """
         handle = ctypes.c_void_p()
-        buffer = ctypes.create_string_buffer(data, max(len(data), 1))
+        inside, beside = parted(data)
+        buffer = ctypes.create_string_buffer(inside, max(len(inside), 1))
         word = "DeSerializeFMUstate" if self.file.version == 2 else "DeserializeFMUState"
-        self.call(word, self._bytes(buffer), len(data), ctypes.byref(handle))
-        with FmuState(self, handle, time) as state:
+        self.call(word, self._bytes(buffer), len(inside), ctypes.byref(handle))
+        with FmuState(self, handle, time, beside) as state:
             self.set_state(state)
 
     def _bytes(self, buffer: ctypes.Array[ctypes.c_char]) -> Any:

@@ -124,6 +124,14 @@ class ModelExchangeInstance(FmuInstance):
         """In Event Mode: update the discrete states once."""
         return update_discrete_states(self)
 
+    # ---- state ----------------------------------------------------------------------------------
+
+    def _beside(self) -> dict[str, Any]:
+        return {"time": self.time, "next_event": self.next_event}
+
+    def _set_beside(self, kept: dict[str, Any]) -> None:
+        self.time, self.next_event = kept["time"], kept["next_event"]
+
     # ---- values ---------------------------------------------------------------------------------
 
     def set_time(self, time: float) -> None:

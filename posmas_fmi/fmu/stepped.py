@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
-from posmas_fmi.fmu.state import FmuState
 from posmas_fmi.fmu.variables import Ports
 
 RTOL = 1e-8  # of the integration, unless the run says another one
@@ -83,15 +84,10 @@ class SteppedInstance(ModelExchangeInstance):
         """Integrate from `time` over `step` [s]; state and time events are handled on the way."""
         self.advance(time + step, self.rtol)
 
-    def get_state(self) -> FmuState:
-        """Save the whole state of the instance."""
-        state = super().get_state()
-        state.beside = (self.next_event, dict(self._held))
-        return state
+    def _beside(self) -> dict[str, Any]:
+        held = [[list(ports.names), values.tolist()] for ports, values in self._held.items()]
+        return {**super()._beside(), "held": held}
 
-    def set_state(self, state: FmuState) -> None:
-        """Go back to a state saved from this instance."""
-        super().set_state(state)
-        if state.beside is not None:
-            self.next_event, held = state.beside
-            self._held = dict(held)
+    def _set_beside(self, kept: dict[str, Any]) -> None:
+        super()._set_beside(kept)
+        self._held = {self.file.ports(names): np.array(held) for names, held in kept["held"]}

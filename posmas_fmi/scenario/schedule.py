@@ -171,8 +171,7 @@ def make_schedule(scenario: Scenario, instances: Instances, abouts: list[About])
 
 def _require_rollback(names: tuple[str, ...], abouts: list[About]) -> None:
     for name, about in zip(names, abouts, strict=True):
-        interface = about.description.coSimulation
-        if about.kind == "Co-Simulation" and not interface.canGetAndSetFMUstate:
+        if not getattr(about.interface, "canGetAndSetFMUstate", False):
             raise InputError(
                 f"{name}: {about.path.name} cannot give and take back its state, so its steps "
                 'cannot be repeated; take coupling = "jacobi" or "gauss-seidel"',

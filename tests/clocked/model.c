@@ -5,6 +5,7 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <stdlib.h>
+#include <string.h>
 
 #if defined _WIN32
 #define EXPORT __declspec(dllexport)
@@ -190,5 +191,29 @@ EXPORT int fmi3FreeFMUState(Sampler *s, Sampler **state)
     (void)s;
     free(*state);
     *state = NULL;
+    return OK;
+}
+
+EXPORT int fmi3SerializedFMUStateSize(Sampler *s, const Sampler *state, size_t *size)
+{
+    (void)s, (void)state;
+    *size = sizeof *state;
+    return OK;
+}
+
+EXPORT int fmi3SerializeFMUState(Sampler *s, const Sampler *state, uint8_t *bytes, size_t size)
+{
+    (void)s;
+    memcpy(bytes, state, size);
+    return OK;
+}
+
+EXPORT int fmi3DeserializeFMUState(Sampler *s, const uint8_t *bytes, size_t size, Sampler **state)
+{
+    if (size != sizeof **state)
+        return ERROR;
+    *state = *state ? *state : malloc(sizeof **state);
+    memcpy(*state, bytes, size);
+    (void)s;
     return OK;
 }

@@ -77,9 +77,7 @@ class RemoteFile(FmuFile):
     def saves(self) -> bool:
         """Whether it says that its state can be taken out as bytes."""
         interface = self.about.interface
-        return self.kind == "Co-Simulation" and bool(
-            interface.canGetAndSetFMUstate and interface.canSerializeFMUstate
-        )
+        return bool(interface.canGetAndSetFMUstate and interface.canSerializeFMUstate)
 
     def instantiate(self, name: str) -> RemoteInstance:
         """Create an instance in a worker process."""
@@ -221,6 +219,17 @@ class RemoteInstance(FmuInstance):
     def deserialise(self, data: bytes, time: float) -> None:
         """Go to a serialised state."""
         self._ask("deserialise", data, time=time)
+        self.time = time
+
+    def keep(self) -> None:
+        """Let the worker keep the state, in place of the one that it kept before."""
+        with _Lost(self):
+            self.worker.request({"do": "keep", "key": self.key})
+
+    def go_back(self, time: float) -> None:
+        """Go back to the state that the worker keeps, of that time [s]."""
+        with _Lost(self):
+            self.worker.request({"do": "go_back", "key": self.key})
         self.time = time
 
     def get_state(self) -> FmuState:

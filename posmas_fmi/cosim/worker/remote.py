@@ -413,10 +413,18 @@ class Remote:
         self._next_snapshot = now + max(SNAPSHOT_EVERY, SNAPSHOT_SHARE * (now - began))
 
     def save(self, number: int) -> Any:
-        """Keep the state of an instance, for `restore`; not what it is brought back to."""
+        """Keep the state of an instance, for `restore`; not what it is brought back to.
+
+        Where it cannot be had as bytes, the worker keeps it: the last one of each instance.
+        """
         instance = self._remote[number]
         slot, _, _ = self._slot(number)
-        return instance.serialise(), slot.t + slot.h, self._entries[number].past.n
+        data = None
+        if instance.file.saves:
+            data = instance.serialise()
+        else:
+            instance.keep()
+        return data, slot.t + slot.h, self._entries[number].past.n
 
     def begin_at(self, number: int, data: bytes, time: float) -> None:
         """Note that an instance stands in that state now, from which it can be brought back."""
@@ -428,7 +436,10 @@ class Remote:
     def restore(self, number: int, saved: Any) -> None:
         """Go back to a state that was kept: the steps since then are as if they had not been."""
         data, time, steps = saved
-        self._remote[number].deserialise(data, time)
+        if data is None:
+            self._remote[number].go_back(time)
+        else:
+            self._remote[number].deserialise(data, time)
         self._entries[number].past.n = steps
 
     def _save(self, number: int, instance: RemoteInstance) -> None:

@@ -23,6 +23,7 @@ from posmas_fmi.errors import FmuCallError, PosmasError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.open import open_fmu
+from posmas_fmi.fmu.state import FmuState
 
 Answer = tuple[Any, bytes]
 
@@ -83,6 +84,7 @@ class Server:
         self._messages = NativeMessages(self._library, memory.messages)
         self._files: dict[str, FmuFile] = {}
         self._instances: dict[int, FmuInstance] = {}
+        self._kept: dict[int, FmuState] = {}
         self._loop = layout.WorkerLoop(
             ctypes.addressof(memory.head), None, None, None, settings.spins, 0
         )
@@ -144,6 +146,7 @@ class Server:
             raise ValueError(f"no method {method}")
         if method == "free":
             del self._instances[request.content["key"]]
+            self._kept.pop(request.content["key"], None)
         if method in ("read", "write"):
             arguments = {**arguments, "ports": instance.file.ports(arguments["ports"])}
         if method == "deserialise":
@@ -154,6 +157,20 @@ class Server:
         if isinstance(result, np.ndarray):
             result = result.tolist()
         return result, b""
+
+    def _do_keep(self, request: frames.Frame) -> Answer:
+        """Keep the state of an instance here, in place of the one that was kept before."""
+        key = request.content["key"]
+        if key in self._kept:
+            self._kept.pop(key).free()
+        self._kept[key] = self._instances[key].get_state()
+        return None, b""
+
+    def _do_go_back(self, request: frames.Frame) -> Answer:
+        """Take an instance back to the state that is kept here."""
+        key = request.content["key"]
+        self._instances[key].set_state(self._kept[key])
+        return None, b""
 
     def _do_bind(self, request: frames.Frame) -> Answer:
         """Take the instances that the loop is to step, and where their values are exchanged."""
