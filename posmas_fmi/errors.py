@@ -115,6 +115,10 @@ class FmuCallError(FmuError):
         self.time = time
 
 
+class FmuEndedError(FmuCallError):
+    """An FMU asked to end the simulation; a run ends there, and that is no failure."""
+
+
 class FmuLostError(FmuCallError):
     """The process that ran an FMU ended, or did not answer in time.
 

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
@@ -18,7 +19,7 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.cosim import engine, native
 from posmas_fmi.cosim.channel import Arrivals, Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
-from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
+from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.errors import BuildError, FmuCallError, InputError
@@ -256,6 +257,7 @@ class Fragile(Case):
     """Agents that follow `FRAGILE`; `values` are the parameters of some of them."""
 
     values: dict[int, list[float]] = attrs.field(factory=dict)
+    isolation: Isolation = Isolation("none")
 
     def plant(self, cache: Path) -> FmuPlant:
         fmu = build.fmu(fragile(), self.fmi, cache=cache)
@@ -264,7 +266,13 @@ class Fragile(Case):
         states = self.ports("x", 2) if self.shows_states else None
         names = digraph(self.n).names
         return FmuPlant.of_agents(
-            names, specs, self.ports("u", 1), self.ports("y", 2), states, self.until
+            names,
+            specs,
+            self.ports("u", 1),
+            self.ports("y", 2),
+            states,
+            self.until,
+            self.isolation,
         )
 
 
@@ -305,7 +313,6 @@ STEPPED = "    *lastSuccessfulTime = INSTANCE(instance)->state.v[AT_TIME];"
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
-        ("*terminateSimulation = true;", "asked to end the simulation"),
         ("return (fmi3Status)-7;", "-7 (outside the standard)"),
         ("return fmi3Discard;", "2 (Discard)"),
     ],
@@ -318,6 +325,37 @@ def test_odd_answers_of_an_fmu(
     assert expected[0].ended == "failed"
     assert reason in expected[0].reason
     assert_alike(run(Fragile(), tmp_path, "c"), expected)
+
+
+ENDS = {
+    2: (
+        (
+            "    return c ? (fmi2Status)instance_step(",
+            "    if (currentCommunicationPoint > 0.295)\n        return fmi2Discard;\n"
+            "    return c ? (fmi2Status)instance_step(",
+        ),
+        ("*value = fmi2False;", "*value = fmi2True;"),
+    ),
+    3: ((STEPPED, f"{STEPPED}\n    {LATE}\n        *terminateSimulation = true;"),),
+}
+
+
+@pytest.mark.parametrize("where", ["none", "process"])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_may_end_the_simulation(
+    fmi: int, where: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is no failure, also where failures do not end the run, and all before is kept."""
+    for old, new in ENDS[fmi]:
+        changed(monkeypatch, fmi, old, new)
+    for what in ("stop", "freeze"):
+        case = Fragile(fmi=fmi, isolation=Isolation(where, on_failure=what))
+        for which in ("numpy", "c"):
+            outcome, rows = run(case, tmp_path, which)
+            assert (outcome.ended, outcome.failed_agent) == ("terminated", "1")
+            assert f"fmi{fmi}DoStep: asked to end the simulation at 0.3" in outcome.reason
+            assert outcome.incidents == ()
+            assert outcome.steps == len(rows["time"]) - 1 == 30
 
 
 STEP = "    Status status =\n        instance_step("

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from fmu_examples import tank_fmu
+from fmu_scenarios import one_fmu
 from test_scenario_faults import scenario
 
 from posmas_fmi import load, run
@@ -107,3 +109,13 @@ def test_the_word_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["run", path, "--schedule"]) == 2
     assert "--outside" in capsys.readouterr().err
     assert main(["run", path, "--schedule", "--outside"]) == 0
+
+
+def test_a_relative_path_holds_in_worker_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They stand in another folder."""
+    more = 'isolation = "process"'
+    one_fmu(tmp_path, tank_fmu(tmp_path, 2), '"power"', '"temperature"', more)
+    monkeypatch.chdir(tmp_path)
+    assert run(load("one.toml"), Path("out"), report=False).summary["ended"] == "complete"

@@ -31,7 +31,7 @@ from posmas_fmi.cosim.master import (
 )
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.snapshot import Snapshot, arrivals_state, set_arrivals
-from posmas_fmi.errors import BuildError, InputError
+from posmas_fmi.errors import BuildError, FmuEndedError, InputError
 from posmas_fmi.expression import Array
 
 log = logging.getLogger(__name__)
@@ -540,7 +540,8 @@ class Engine:
         if self._e.ended == _FAILED and not ended:
             try:
                 error = self._plant.fmus.error(self._reports[0].failure, time_now)
-                ended, reason, agent = "failed", str(error), error.agent
+                ended = "terminated" if isinstance(error, FmuEndedError) else "failed"
+                reason, agent = str(error), error.agent
             except KeyboardInterrupt:  # during a call that goes through Python
                 ended, reason = "cancelled", "interrupted"
         elif self._e.ended == _DIVERGED and not ended:

@@ -14,7 +14,7 @@ import numpy as np
 from posmas_fmi.cosim.failure import Action, Failure
 from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.served import Served, needs_python
-from posmas_fmi.errors import FmuCallError, FmuError
+from posmas_fmi.errors import FmuCallError, FmuEndedError, FmuError
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
 from posmas_fmi.fmu.variables import Ports
 
@@ -96,6 +96,8 @@ class _Binding(ctypes.Structure):
         ("get", _pointer),
         ("set", _pointer),
         ("do_step", _pointer),
+        ("boolean_status", _pointer),
+        ("real_status", _pointer),
         ("inputs", _Ports),
         ("readings", _Ports),
     )
@@ -337,7 +339,7 @@ class Fmus:
         if needs_python(file, file.ports(inputs.variables), file.ports(readings.variables)):
             served = self._served
             return _Binding(
-                *(3, served.get, served.set, served.do_step),
+                *(3, served.get, served.set, served.do_step, None, None),
                 *(self._served_ports(file, ports) for ports in (inputs, readings)),
             )
         prefix, real = f"fmi{file.version}", "Real" if file.version == 2 else "Float64"
@@ -346,6 +348,7 @@ class Fmus:
             file.address(f"{prefix}Get{real}"),
             file.address(f"{prefix}Set{real}"),
             file.address(f"{prefix}DoStep"),
+            *(_optional(file, name) for name in ("fmi2GetBooleanStatus", "fmi2GetRealStatus")),
             self._c_ports(file.ports(inputs.variables), inputs),
             self._c_ports(file.ports(readings.variables), readings),
         )
@@ -405,12 +408,13 @@ class Fmus:
     def error(self, failure: Incident, time: float) -> FmuCallError:
         """Return what ended the run as an error, and note it; the run stood at `time` [s].
 
-        What a call through Python raised, and is no `FmuError`, is raised here.
+        An FMU that asked for the end is an `FmuEndedError`, and no failure. What a call through Python raised, and is no `FmuError`, is raised here.
         """
         if self._remote is not None and self._remote.is_remote[failure.instance]:
             return self._remote.error(failure)
         error = self._error(failure, time)
-        self.failures.append(self._failure(failure, error, "stopped"))
+        if not isinstance(error, FmuEndedError):
+            self.failures.append(self._failure(failure, error, "stopped"))
         return error
 
     def freeze(self, incident: Incident, time: float) -> None:
@@ -549,6 +553,14 @@ class FmuLoop:
         self._fmus.warn(report, time)
         if report.failure.call:
             raise self._fmus.error(report.failure, time)
+
+
+def _optional(file: FmuFile, function: str) -> int | None:
+    """Address of a function of FMI 2 that not every binary has."""
+    try:
+        return file.address(function) if file.version == 2 else None
+    except FmuError:
+        return None
 
 
 def _starts(sizes: Sequence[int]) -> Whole:

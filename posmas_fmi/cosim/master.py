@@ -19,7 +19,7 @@ from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import Heard, Law, Weights
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.wiring import Whole, Wiring
-from posmas_fmi.errors import FmuCallError
+from posmas_fmi.errors import FmuCallError, FmuEndedError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
@@ -223,7 +223,8 @@ class Outcome:
 
     Attributes
     ----------
-    ended : {"complete", "diverged", "failed", "cancelled"}
+    ended : {"complete", "terminated", "diverged", "failed", "cancelled"}
+        Terminated: an FMU asked for the end.
     steps : int
         Communication steps done.
     time : float
@@ -239,11 +240,12 @@ class Outcome:
     reason : str
         Empty for a complete run.
     failed_agent : str
+        Or that whose FMU asked for the end.
     incidents : tuple of Failure
         FMUs that failed, and what was done about it.
     """
 
-    ended: Literal["complete", "diverged", "failed", "cancelled"]
+    ended: Literal["complete", "terminated", "diverged", "failed", "cancelled"]
     steps: int
     time: float
     tracking_error: Array
@@ -376,6 +378,8 @@ class Run:
                 self._loop(interrupt)
         except _Stop as stop:
             ended, reason, agent = stop.ended, stop.reason, stop.agent
+        except FmuEndedError as error:
+            ended, reason, agent = "terminated", str(error), error.agent
         except FmuCallError as error:
             ended, reason, agent = "failed", str(error), error.agent
         except KeyboardInterrupt:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from posmas_fmi.errors import FmuEndedError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import Ports
@@ -65,8 +66,16 @@ class Served:
             given = np.ctypeslib.as_array(values, (size,))
             return guarded(key, lambda instance: instance.write(known[references[0]], given))
 
-        def do_step(key: int | None, time: float, step: float, *_: Any) -> int:
-            return guarded(key, lambda instance: instance.do_step(time, step))
+        def do_step(
+            key: int | None, time: float, step: float, _: bool, __: Any, ends: Any, *rest: Any
+        ) -> int:
+            def go(instance: FmuInstance) -> None:
+                try:
+                    instance.do_step(time, step)
+                except FmuEndedError as end:
+                    ends[0], rest[1][0] = True, end.time
+
+            return guarded(key, go)
 
         self._functions = _Exchange(get), _Exchange(set_), _Step(do_step)
         self.get, self.set, self.do_step = (

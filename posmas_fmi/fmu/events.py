@@ -71,7 +71,7 @@ def settle(instance: FmuInstance) -> float:
     for _ in range(_MOST_ITERATIONS):
         info = update_discrete_states(instance)
         if info.terminate:
-            raise instance.error(_name(instance), "asked to end the simulation")
+            raise instance.ended(_name(instance), instance.time)
         if not info.again:
             return info.next_event
     raise instance.error(

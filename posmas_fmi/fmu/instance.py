@@ -7,6 +7,7 @@ import logging
 import math
 import weakref
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -14,7 +15,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from posmas_fmi.errors import FmuCallError, FmuError
+from posmas_fmi.errors import FmuCallError, FmuEndedError, FmuError
 from posmas_fmi.fmu.callbacks import said
 from posmas_fmi.fmu.live import free_instance
 from posmas_fmi.fmu.state import FmuState, joined, parted
@@ -28,7 +29,8 @@ _LOG = logging.getLogger(__name__)
 _MOST_RETURNS = 100_000  # before the end of one step
 _MOST_STUCK = 100  # of them at the same time
 _SAME = 1e-9  # of a step: times that are the same
-_PENDING = 5
+_DISCARD, _PENDING = 2, 5
+_LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3  # fmi2StatusKind
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 
 
@@ -98,6 +100,7 @@ class FmuInstance:
         self._prefix = f"fmi{file.version}"
         self._real = "Real" if file.version == 2 else "Float64"
         self._state = "FMUstate" if file.version == 2 else "FMUState"
+        self._status = 0  # of the last call
         self._free = weakref.finalize(self, free_instance, file._live, key, file._frees)
 
     def __enter__(self) -> Self:
@@ -131,6 +134,7 @@ class FmuInstance:
             raise self.error(function, "the instance was freed")
         self.file._messages.forget(self.key)
         status = self.file._functions[self._prefix + function](self.component, *arguments)
+        self._status = status
         if status == 0:
             return
         if status == 1:
@@ -170,8 +174,16 @@ class FmuInstance:
 
     def ended_early(self, terminates: bool, reached: float) -> FmuCallError:
         """Return the error for a step that did not get to its end."""
-        what = "asked to end the simulation" if terminates else "returned early"
-        return self.error("DoStep", f"{what} at {reached!r} s")
+        if terminates:
+            return self.ended("DoStep", reached)
+        return self.error("DoStep", f"returned early at {reached!r} s")
+
+    def ended(self, function: str, reached: float) -> FmuEndedError:
+        """Return what is told when the FMU asks to end the simulation, which is no failure."""
+        where = self._where(function)
+        return FmuEndedError(
+            f"asked to end the simulation at {reached:g} s", where, self.name, reached
+        )
 
     def not_finite(self, port: str, value: float) -> FmuCallError:
         """Return the error for a value that is not finite."""
@@ -265,7 +277,12 @@ class FmuInstance:
             Also if the FMU asks to end the simulation.
         """
         if self.file.version == 2:
-            self.call("DoStep", time, step, 0)
+            try:
+                self.call("DoStep", time, step, 0)
+            except FmuCallError:
+                if self._status == _DISCARD and self._asks_to_end():
+                    raise self.ended_early(True, self._last_time(time)) from None
+                raise
             return Step(time + step)
         event, terminate, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
         last = ctypes.c_double(time)
@@ -274,6 +291,20 @@ class FmuInstance:
         if terminate.value:
             raise self.ended_early(True, last.value)
         return Step(last.value if early.value else time + step, early.value, event.value)
+
+    def _asks_to_end(self) -> bool:
+        """After Discard: whether it is because the FMU wants to end the simulation (FMI 2)."""
+        terminated = ctypes.c_int()
+        with suppress(FmuError):
+            self.call("GetBooleanStatus", _TERMINATED, ctypes.byref(terminated))
+        return bool(terminated.value)
+
+    def _last_time(self, time: float) -> float:
+        """Where the step got to [s]."""
+        reached = ctypes.c_double(time)
+        with suppress(FmuError):
+            self.call("GetRealStatus", _LAST_SUCCESSFUL_TIME, ctypes.byref(reached))
+        return reached.value
 
     def terminate(self) -> None:
         """End the simulation; values may still be read."""

@@ -256,7 +256,7 @@ class ModelExchangeInstance(FmuInstance):
         by = ctypes.byref
         self.call("CompletedIntegratorStep", True, by(event), by(terminate))
         if terminate.value:
-            raise self.error("CompletedIntegratorStep", "asked to end the simulation")
+            raise self.ended("CompletedIntegratorStep", self.time)
         return bool(event.value)
 
     def do_step(self, time: float, step: float) -> None:

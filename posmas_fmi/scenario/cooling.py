@@ -460,7 +460,7 @@ def judge(
         if agent["status"] in ("converged", "not converged", "positivity lost"):
             agent["status"] = _status(agent)
     statuses = [agent["status"] for agent in summary["agents"]]
-    if outcome.ended == "complete":
+    if outcome.ended in ("complete", "terminated"):
         order = ("positivity lost", "not converged")
         summary["verdict"] = next((s for s in order if s in statuses), "converged")
     summary |= {

@@ -272,12 +272,12 @@ def _simulate(
         thinned.finish()
         recorder.flush()
         baseline = None
-        if baselines and outcome.ended in ("complete", "diverged"):
+        if baselines and outcome.ended in ("complete", "terminated", "diverged"):
             add = recorder.add if with_baseline else lambda values: None
             baseline = _without_control(
                 scenario, designed, instances, choice, add, thinned.rows, progress
             )
-        if outcome.ended == "complete":
+        if outcome.ended in ("complete", "terminated"):
             recorder.finish()
     return outcome, baseline
 

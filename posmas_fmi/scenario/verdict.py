@@ -25,7 +25,8 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
     -------
     dict
         ``verdict`` is one of ``converged``, ``not converged``, ``positivity lost``, ``diverged``,
-        ``failed``, ``cancelled``.
+        ``failed``, ``cancelled``. ``ended`` tells how the run ended; ``terminated``: an FMU asked
+        for it, and the verdict is about the state by then.
     """
     agents = [
         {
@@ -41,6 +42,7 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
     ]
     return {
         "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
+        "ended": outcome.ended,
         "reason": outcome.reason or _frozen_reason(outcome),
         "agents": agents,
         "tracking_error_final": _finite(outcome.tracking_error.max()),

@@ -458,7 +458,7 @@ static void carry(const Engine *e, const Point *p, int64_t i)
 /* An instance did not do what it was told: the run ends, or goes on without it. */
 static void failed(const Engine *e, const Point *p, int64_t i, Report *report, Signal *signal)
 {
-    if (!e->freezes) {
+    if (!e->freezes || report->failure.call == CALL_STEP_TERMINATED) {
         signal->failed = 1;
         return;
     }

@@ -11,11 +11,14 @@
 typedef int Get2(void *, const uint32_t[], size_t, double[]);
 typedef int Set2(void *, const uint32_t[], size_t, const double[]);
 typedef int Step2(void *, double, double, int);
+typedef int BooleanStatus2(void *, int, int *);
+typedef int RealStatus2(void *, int, double *);
 typedef int Get3(void *, const uint32_t[], size_t, double[], size_t);
 typedef int Set3(void *, const uint32_t[], size_t, const double[], size_t);
 typedef int Step3(void *, double, double, bool, bool *, bool *, bool *, double *);
 
-enum { OK, WARNING };
+enum { OK, WARNING, DISCARD };
+enum { LAST_SUCCESSFUL_TIME = 2, TERMINATED }; /* fmi2StatusKind */
 enum { MOST_RETURNS = 100000 }; /* before the end of one step */
 #define SAME 1e-9               /* of a step: times that are the same */
 
@@ -90,6 +93,18 @@ static int convert(const Fmus *f, const Binding *b, int64_t instance, const doub
     return 1;
 }
 
+/* Whether an FMU of FMI 2 that returned Discard asks to end the simulation, and where it is. */
+static int asks_to_end(const Binding *b, void *component, double *reached)
+{
+    int terminated = 0;
+    if (!b->boolean_status ||
+        ((BooleanStatus2 *)b->boolean_status)(component, TERMINATED, &terminated) != OK)
+        return 0;
+    if (terminated && b->real_status)
+        ((RealStatus2 *)b->real_status)(component, LAST_SUCCESSFUL_TIME, reached);
+    return terminated != 0;
+}
+
 int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double *inputs,
               double *scratch, Report *report)
 {
@@ -109,6 +124,11 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
     begin(f, CALL_STEP, instance);
     if (b->fmi == 2) {
         status = ((Step2 *)b->do_step)(component, t, h, 0);
+        double reached = t;
+        if (status == DISCARD && asks_to_end(b, component, &reached))
+            return fail(report, (Incident){.call = CALL_STEP_TERMINATED,
+                                           .instance = instance,
+                                           .value = reached});
         return status == OK || odd(status, CALL_STEP, instance, before, report);
     }
     double begin_at = t, length = h;
@@ -165,10 +185,10 @@ int incident_before(const Incident *a, const Incident *b)
 /* ---- many instances in one call, for a loop that is not in C --------------------------------- */
 
 /* Whether to go on with other instances after one that failed: where `incidents`, one of each
- * instance, are wanted. NULL: the first failure ends it. */
+ * instance, are wanted. NULL: the first failure ends it, and so does an FMU that asks for the end. */
 static int goes_on(Incident *incidents, int64_t instance, Report *report)
 {
-    if (!incidents)
+    if (!incidents || report->failure.call == CALL_STEP_TERMINATED)
         return 0;
     incidents[instance] = report->failure;
     report->failure.call = CALL_NONE;

@@ -26,6 +26,8 @@ typedef struct {
     void (*get)(void);
     void (*set)(void);
     void (*do_step)(void);
+    void (*boolean_status)(void); /* FMI 2, after Discard; NULL: not there */
+    void (*real_status)(void);
     Ports inputs;
     Ports readings; /* outputs y, then states x where they are shown */
 } Binding;

@@ -201,7 +201,7 @@ static int remote_wait(void *context, int64_t i, double *readings, Report *repor
             if (!why)
                 incident.instance = i;
             x->incident = incident;
-            again = r->recover && r->recover(i);
+            again = incident.call != CALL_STEP_TERMINATED && r->recover && r->recover(i);
         }
         __atomic_store_n(&r->recovering, 0, __ATOMIC_RELEASE);
         if (!again) {

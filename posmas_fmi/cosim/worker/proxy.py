@@ -124,7 +124,7 @@ class RemoteInstance(FmuInstance):
     def make(self, worker: WorkerProcess) -> None:
         """Be a fresh instance in that worker process."""
         self.worker = worker
-        path = str(self.file.path)
+        path = str(self.file.path.absolute())  # the worker is in another folder
         with _Lost(self):
             worker.load(path, str(self.file.folder), self.file.about.structure)
             self.key, _ = worker.request({"do": "instantiate", "path": path, "name": self.name})

@@ -30,6 +30,7 @@ SNAPSHOT_SHARE = 20.0  # and so many times as long as the last one took
 PAST = 64 * 2**20  # bytes of inputs that are kept for one instance
 TOO_SOON = 10  # steps after a restart within which a failure is final
 _FATAL = 4
+_TERMINATED = 4  # the call of an incident
 
 
 class Remote:
@@ -207,15 +208,16 @@ class Remote:
         if incident.call == 7:  # not finite
             name = self._readings[number].variables[incident.port]
             return Failure(**facts, call=call, cause=f"{name} is not finite ({incident.value:g})")
-        if incident.call in (4, 5):
-            what = "asked to end the simulation" if incident.call == 4 else "returned early"
-            return Failure(**facts, call=call, cause=f"{what} at {incident.value!r} s")
+        if incident.call == 5:
+            return Failure(**facts, call=call, cause=f"returned early at {incident.value!r} s")
         cause = f"returned status {incident.status} ({status_label(incident.status)})"
         return Failure(**facts, call=call, cause=cause, status=incident.status)
 
     def error(self, incident: Incident) -> FmuCallError:
         """Return an incident that ended the run as an error, and note it."""
         number = incident.instance
+        if incident.call == _TERMINATED:
+            return self._remote[number].ended("DoStep", incident.value)
         if self._entries[number].given_up:
             failure = self._final[number]
         else:

@@ -112,7 +112,7 @@ class Trial:
             code = "not-loaded"
         elif "asked to end" in text:
             code = "terminates"
-            severity = "fatal" if board.vital else "warning"
+            severity = "fatal" if board.vital else "note"
         elif "returned early" in text:
             code = "stuck"
         else:
