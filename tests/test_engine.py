@@ -257,7 +257,7 @@ class Fragile(Case):
     """Agents that follow `FRAGILE`; `values` are the parameters of some of them."""
 
     values: dict[int, list[float]] = attrs.field(factory=dict)
-    isolation: Isolation = Isolation("none")
+    isolation: Isolation = attrs.field(factory=lambda: Isolation("none"))
 
     def plant(self, cache: Path) -> FmuPlant:
         fmu = build.fmu(fragile(), self.fmi, cache=cache)

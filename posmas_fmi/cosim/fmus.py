@@ -408,7 +408,8 @@ class Fmus:
     def error(self, failure: Incident, time: float) -> FmuCallError:
         """Return what ended the run as an error, and note it; the run stood at `time` [s].
 
-        An FMU that asked for the end is an `FmuEndedError`, and no failure. What a call through Python raised, and is no `FmuError`, is raised here.
+        An FMU that asked for the end is an `FmuEndedError`, and no failure. What a call through
+        Python raised, and is no `FmuError`, is raised here.
         """
         if self._remote is not None and self._remote.is_remote[failure.instance]:
             return self._remote.error(failure)
