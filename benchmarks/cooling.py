@@ -25,6 +25,7 @@ from posmas_fmi.cooling import (
     generate_loads,
     line_agent,
     read_loads,
+    training_loads,
 )
 from posmas_fmi.cooling.law import team_network
 from posmas_fmi.cooling.mpc import PredictiveLaw
@@ -33,6 +34,7 @@ from posmas_fmi.design import Design, DesignSettings, design
 from posmas_fmi.network import Network, network_from_arcs
 from posmas_fmi.scenario.cooling import INTEGRAL_TIME
 
+SHELL = ("set_point_at", "set_point_after", "feedforward_time")
 UNEQUAL = np.linspace(40e3, 130e3, 8)
 # what a prototype of the physics gave: RMS, worst upwards, spread at the end [K], strokes per 2 h
 PROTOTYPE = {
@@ -63,7 +65,7 @@ def gains(made: Design) -> dict[str, Any]:
 
 def run(name: str, made: Design, loads: Loads, until: float, **changes: Any) -> RowResult:
     """Run one controller."""
-    shell = {k: changes.pop(k) for k in ("set_point_at", "set_point_after") if k in changes}
+    shell = {k: changes.pop(k) for k in SHELL if k in changes}
     row = Row(made.network, loads, controller(name, **gains(made), **shell), until, **changes)
     if name == "team":
         teams = team_network(made.network.N)
@@ -141,9 +143,24 @@ def days(agent: Agent, path: Path | None) -> None:
             print(f"   {len(pins)} pinned: " + "   ".join(cells))
 
 
+def filters(agent: Agent) -> None:
+    """AI training: what the filter of the feedforward costs and saves."""
+    print("\n4. Filter of the feedforward, AI training, 2 h: RMS [K], worst [K], strokes per hour")
+    made = design(agent, ring(8, [1]), DesignSettings(), 5.0)
+    kinds = {"mean power of a period": 5.0, "power of a moment": 0.1}
+    for text, step in kinds.items():
+        loads = training_loads(8, 7200.0, seed=1, maximum=120e3, step=step)
+        for seconds in (5.0, None, 30.0, 60.0):
+            cells = []
+            for name in ("pi", "pi_ff", "integral_ff"):
+                f = run(name, made, loads, 7200.0, delay=5.0, feedforward_time=seconds).figures()
+                cells.append(f"{name} {f.rms:.3f}, {f.worst:.2f}, {f.strokes_per_hour:.1f}")
+            print(f"   {text}, {seconds or 'default'} s: " + "   ".join(cells))
+
+
 def periods(agent: Agent) -> None:
     """Longer periods: with the gains for 5 s, and with those designed for the period."""
-    print("\n4. Period: RMS deviation [K] of `integral`, ranking case without the set-point step")
+    print("\n5. Period: RMS deviation [K] of `integral`, ranking case without the set-point step")
     loads = Loads([0.0, 600.0], [np.full(8, 80e3), UNEQUAL])
     network = ring(8, [1])
     five = design(agent, network, DesignSettings(), 5.0)
@@ -169,7 +186,7 @@ def observer_step(agent: Agent, E: Any, h: float) -> Any:
 
 def thousand(agent: Agent) -> None:
     """A thousand lines for two hours."""
-    print("\n5. 1000 lines, every eighth pinned, 2 h at 5 s")
+    print("\n6. 1000 lines, every eighth pinned, 2 h at 5 s")
     network = ring(1000, list(range(1, 1001, 8)))
     began = time.perf_counter()
     made = design(agent, network, DesignSettings(), 5.0)
@@ -207,6 +224,7 @@ PARTS: dict[str, Callable[..., None]] = {
     "ranking": ranking,
     "shortage": shortage,
     "days": days,
+    "filters": filters,
     "periods": periods,
     "thousand": thousand,
 }

@@ -6,15 +6,21 @@ from pathlib import Path
 import attrs
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import posmas_fmi
 from posmas_fmi.cooling import LineParameters
-from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, controller, parameters
+from posmas_fmi.cooling.control import (
+    CONTROLLERS,
+    WHAT_IS_PROVED,
+    controller,
+    mean_delays,
+    parameters,
+)
 from posmas_fmi.cooling.law import (
     FALLBACK,
     LineControllers,
     Memory,
-    messages,
     own_values,
     start_memory,
 )
@@ -111,7 +117,7 @@ def reading(n, random=None, valve=LINE.y0):
 
 
 def test_sizes_are_those_of_the_header(library):
-    assert [library.sizes(k) for k in range(4)] == [9, 4, 5, 8]
+    assert [library.sizes(k) for k in range(4)] == [10, 4, 5, 8]
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -130,7 +136,7 @@ def test_c_and_numpy_agree(library, name):
     stated = LineControllers(LINE, stated.control, own, H)
     in_c = InC(library, stated)
     memory = start_memory(np.tile(LINE.theta0, (6, 1)) + random.normal(size=(6, 3)), 5.0)
-    leader = np.zeros(9)
+    leader = np.zeros(10)
     leader[:3] = LINE.theta0
     for k in range(120):
         measured = reading(6, random, valve=0.7)
@@ -139,7 +145,7 @@ def test_c_and_numpy_agree(library, name):
         disagreement = random.normal(size=(6, 4))
         silence = np.where((random.random((6, 1)) < 0.2), 300.0, 0.0) * np.ones(2)
         np.testing.assert_allclose(
-            in_c.send(memory, measured), messages(stated.control, memory, measured), rtol=1e-15
+            in_c.send(memory, measured), stated.messages(memory, measured), rtol=1e-15
         )
         expected = stated.step(k * H, measured, disagreement, silence, memory)
         for got, wanted in zip(
@@ -283,9 +289,44 @@ def test_printed_sign_is_in_the_weights_only():
     assert all(np.array_equal(a[k], b[k]) for k in a)
 
 
+@pytest.mark.parametrize("set_point", [4.0, 5.0, 6.5])
+@pytest.mark.parametrize("water", [-0.5, 0.0, 1.0])
+@pytest.mark.parametrize("load", [0.35, 1.0, 1.3])
+def test_feedforward_holds_the_set_point_by_itself(set_point, water, load):
+    """In the steady state of a load and a water temperature nothing is left for the law to do."""
+    stated = controllers("pi_ff", n=1, set_point=set_point)
+    v = stated.ahead(np.array([load]), np.array([water]))[0]
+    kappa, power = float(LINE.kappa(stated.valve.position(v))), load * LINE.P0
+    heat = [power * (1 - LINE.kl * LINE.theta_p0) / LINE.Cp, 0.0, kappa * water / LINE.Cs]
+    theta = np.linalg.solve(LINE.A(kappa, power), -np.array(heat))
+    assert theta[2] == pytest.approx(set_point, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("load", "water", "end"), [(9.0, 0.0, 1.0), (1.0, 30.0, 1.0), (0.0, 0, 0.0)]
+)
+def test_feedforward_ends_at_the_ends_of_the_valve(load, water, end):
+    stated = controllers("pi_ff", n=1)
+    v = stated.ahead(np.array([load]), np.array([water]))[0]
+    assert stated.valve.position(v) == pytest.approx(end, abs=1e-12)
+
+
+def test_feedforward_follows_with_the_lag_of_the_load():
+    """A valve that lags by the difference of the mean delays leaves no area of deviation."""
+    behind_load, behind_valve = mean_delays(LINE)
+    A = LINE.A(LINE.kappa0, LINE.P0)
+    times = np.arange(0.0, 2000.0, 2.0) + 1.0
+    response = np.array([expm(A * t)[2, [0, 2]] for t in times])
+    mean = (response * times[:, None]).sum(axis=0) / response.sum(axis=0)
+    np.testing.assert_allclose(mean, [behind_load, behind_valve], rtol=0.02)
+    values = parameters(LINE, controller("pi_ff"), H)
+    assert values["ff_time"][0] == behind_load - behind_valve
+    assert parameters(LINE, controller("pi_ff", feedforward_time=90.0), H)["ff_time"][0] == 90.0
+
+
 def test_leader_settles_at_the_set_point():
     stated = controllers("integral", set_point=6.0)
-    memory = np.zeros(9)
+    memory = np.zeros(10)
     memory[:3] = LINE.theta0
     for k in range(400):
         memory = stated.leader_step(k * H, memory)
@@ -315,6 +356,7 @@ def test_every_controller_says_what_is_proved():
         ({"K": [1.0]}, "shape"),
         ({"kp": -0.1}, "> 0"),
         ({"K_q": 3.0}, "<= 0"),
+        ({"feedforward_time": 0.0}, "> 0"),
         ({"opening": (0.9, 0.1)}, "low < high"),
         ({"silence": -1.0}, ">= 0"),
         ({"sign": "wrong"}, "corrected"),

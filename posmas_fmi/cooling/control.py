@@ -20,7 +20,8 @@ from posmas_fmi.expression import Array
 
 # Numbers of the laws in controller.h.
 LAWS = {"fixed": 0, "proportional": 1, "integral": 2, "set_point": 3, "local": 4, "team": 5}
-MEMORY, MESSAGE, MEASURED = 9, 4, 5
+MEMORY, MESSAGE, MEASURED = 10, 4, 5
+CURVE = 129  # points of the valve curve
 EXTRAS = ("power", "valve", "water")  # measured beside y, in this order
 TEAM = 32  # lines in a team at most, as in vendors' units
 
@@ -57,9 +58,11 @@ class Control:
         PI controllers: valve position per kelvin, and integral time [s]. Also of the fallback and
         of the dew-point override.
     feedforward : bool
-        From the filtered IT power.
-    feedforward_time : float
-        Time constant of that filter [s].
+        Of the measured IT power and the temperature of the facility water: the valve position
+        that holds the set-point in their steady state. It is that of `set_point`; a later one is
+        left to the law.
+    feedforward_time : float, optional
+        Time constant of the filter of both [s]; default the difference of `mean_delays`.
     everyone : bool
         Every line knows the set-point; else only the pinned ones do.
     sign : {"corrected", "printed"}
@@ -92,13 +95,13 @@ class Control:
 
     law: str
     K: Array = attrs.field(default=_K, converter=_matrix)
-    K_q: float = -70.0
+    K_q: float = -101.48  # K over the mean delay behind the valve
     E: Array = attrs.field(default=_E, converter=_matrix)
     consensus: float = 0.02
     kp: float = 0.1
     Ti: float = 120.0
     feedforward: bool = False
-    feedforward_time: float = 60.0
+    feedforward_time: float | None = None
     everyone: bool = True
     sign: str = "corrected"
     tracking: float = 60.0
@@ -122,8 +125,9 @@ class Control:
             if value.shape != shape or not np.isfinite(value).all():
                 raise InputError(f"expected finite numbers of shape {shape} (got {value})", name)
         for name in ("kp", "Ti", "feedforward_time", "tracking", "stroke_time", "reference_time"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"expected a number > 0 (got {getattr(self, name)!r})", name)
+            value = getattr(self, name)
+            if not ((value is None and name == "feedforward_time") or 0 < value < math.inf):
+                raise InputError(f"expected a number > 0 (got {value!r})", name)
         for name in ("consensus", "tolerance", "silence"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"expected a number >= 0 (got {getattr(self, name)!r})", name)
@@ -155,7 +159,8 @@ WHAT_IS_PROVED = {
     "integral": "Certificate I where [design] asks for it: the continuous loop contracts and has "
     "no offset. Not proved: sampling, delays, limits of the valve, the fallback. Positivity by "
     "physics.",
-    "integral_ff": "As integral: what is fed forward does not come back, so the loop is the same.",
+    "integral_ff": "As integral, for the loop about what is fed forward: the IT power does not "
+    "depend on the valves. The facility water does, slowly; that path is not covered.",
     "set_point": "The consensus on the set-point converges (pinned Laplacian, step below one over "
     "the degree). Not proved: the PI loops, coupling through the header.",
     "pi": "Nothing; tuned as in practice.",
@@ -185,38 +190,63 @@ def controller(name: str, **changes: Any) -> Control:
 
 
 @cache
-def feedforward(line: LineParameters, loads: tuple[float, float] = (30e3, 135e3)) -> Array:
-    """Heat to retain over the relative load, ``f1 p + f2 p² + f3 p³`` [W], ``p = P/P0 - 1``.
-
-    A least-squares fit to the valve positions that hold the operating point's supply temperature
-    at constant loads; zero at P0.
+def valve_curve(line: LineParameters, points: int = CURVE) -> tuple[Array, Array]:
+    """Return the heat to retain over the exchanger's conductance: the inverse of valve and ε-NTU.
 
     Parameters
     ----------
     line : LineParameters
-    loads : (float, float)
-        Range of the fit [W], for 80 kW lines; in proportion for others.
+    points : int
 
     Returns
     -------
-    (3,) ndarray
+    kappa : (points,) ndarray
+        Equally spaced, from the closed valve to the open one [W/K].
+    v : (points,) ndarray
+        [W]
 
     Examples
     --------
     >>> line = LineParameters()
-    >>> p = 120e3 / line.P0 - 1
-    >>> v = float(feedforward(line) @ [p, p**2, p**3])
-    >>> y = valve_mapping(line).position(v)
-    >>> round(float(line.steady(120e3, y)[2]), 2)
-    5.01
+    >>> kappa, v = valve_curve(line)
+    >>> y = valve_mapping(line).position(float(np.interp(6000.0, kappa, v)))
+    >>> round(float(line.kappa(y)))
+    6000
     """
+    from scipy.optimize import brentq
+
     valve = valve_mapping(line)
-    low, high = (line.P0 * load / 80e3 for load in loads)
-    grid = np.linspace(low, high, 43)
-    v = [valve.retained(line.position(P)) for P in grid]
-    p = grid / line.P0 - 1
-    powers = np.stack([p, p**2, p**3], axis=1)
-    return np.asarray(np.linalg.lstsq(powers, np.array(v), rcond=None)[0])
+    kappa = np.linspace(float(line.kappa(0.0)), float(line.kappa(1.0)), points)
+    inside = [brentq(lambda y, k=k: float(line.kappa(y)) - k, 0.0, 1.0) for k in kappa[1:-1]]
+    return kappa, np.array([valve.retained(y) for y in (0.0, *inside, 1.0)])
+
+
+def mean_delays(line: LineParameters) -> tuple[float, float]:
+    """Return the mean delays of the supply temperature behind the load and behind the valve [s].
+
+    Of the linear line at the operating point: the mean times of its two impulse responses. Their
+    difference is the lag with which the feedforward should follow the load; the valve's is the
+    integral time of the distributed integral, as in the usual tuning of a PI controller.
+
+    Parameters
+    ----------
+    line : LineParameters
+
+    Examples
+    --------
+    >>> [round(delay, 1) for delay in mean_delays(LineParameters())]
+    [51.6, 30.4]
+    """
+    A = line.A(line.kappa0, line.P0)
+    once = np.linalg.solve(A.T, [0.0, 0.0, 1.0])  # gain: -once b; gain times delay: twice b
+    twice = np.linalg.solve(A.T, once)
+    return float(-twice[0] / once[0]), float(-twice[2] / once[2])
+
+
+def largest_load(line: LineParameters) -> float:
+    """Return the load over P0 up to which feedforward goes: four, and far from thermal runaway."""
+    runaway = math.inf if line.kl == 0 else 1 / (line.P0 * line.kl * line.path)
+    return min(4.0, runaway / 2)
 
 
 def parameters(
@@ -241,6 +271,8 @@ def parameters(
     from scipy.linalg import expm
 
     valve = valve_mapping(line)
+    kappa, curve = valve_curve(line)
+    behind_load, behind_valve = mean_delays(line)
     A = line.A(line.kappa0, line.P0)
     rest = np.array([line.P0 * (1 - line.kl * line.theta_p0) / line.Cp, 0.0, 0.0])
     both = expm(h * np.block([[A, np.eye(3)], [np.zeros((3, 6))]]))
@@ -257,8 +289,13 @@ def parameters(
         "consensus": control.consensus,
         "kp": control.kp / valve.gain,
         "Ti": control.Ti,
-        "ff": feedforward(line) if control.feedforward else np.zeros(3),
-        "ff_time": control.feedforward_time,
+        "forward": float(control.feedforward),
+        "ff_time": control.feedforward_time or behind_load - behind_valve,
+        "load_most": largest_load(line),
+        "path": line.path,
+        "kappa_low": kappa[0],
+        "kappa_step": kappa[1] - kappa[0],
+        "curve": curve,
         "tracking": control.tracking,
         "rate": 1 / control.stroke_time,
         "tolerance": control.tolerance,

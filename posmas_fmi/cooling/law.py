@@ -8,7 +8,7 @@ import attrs
 import numpy as np
 import scipy.sparse as sp
 
-from posmas_fmi.cooling.control import EXTRAS, LAWS, MEMORY, TEAM, Control, parameters
+from posmas_fmi.cooling.control import EXTRAS, LAWS, MEMORY, TEAM, Control, parameters, valve_curve
 from posmas_fmi.cooling.exchanger import conductance
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.mapping import valve_mapping
@@ -94,31 +94,28 @@ class Memory:
     integral: Array
     dew: Array
     reference: Array
-    power: Array
+    load: Array
+    water: Array
     last: Array
     mode: Array
 
     @classmethod
     def of(cls, rows: Array) -> Memory:
-        """Read the rows of controller.h, (N, 9)."""
+        """Read the rows of controller.h, (N, 10)."""
         return cls(rows[:, :3], *rows[:, 3:].T)
 
     def rows(self) -> Array:
-        """Return the rows of controller.h, (N, 9)."""
+        """Return the rows of controller.h, (N, 10)."""
         return np.column_stack(attrs.astuple(self, recurse=False))
 
 
 def start_memory(xhat: Array, reference: float) -> Array:
-    """Return what lines remember at the start, (N, 9)."""
+    """Return what lines remember at the start, (N, 10)."""
     n = len(xhat)
     zero = np.zeros(n)
-    return Memory(np.asarray(xhat), zero, zero, zero + reference, zero, zero, zero + START).rows()
-
-
-def messages(control: Control, memory: Array, measured: Array) -> Array:
-    """Return what each line sends, (N, 4): its estimate, and its supply or set-point."""
-    shared = memory[:, 5] if control.law == "set_point" else measured[:, 1]
-    return np.column_stack([memory[:, :3], shared])
+    return Memory(
+        np.asarray(xhat), zero, zero, zero + reference, zero, zero, zero, zero + START
+    ).rows()
 
 
 class LineControllers:
@@ -152,6 +149,35 @@ class LineControllers:
         """Return the set-point at a time [K above the facility's nominal supply]."""
         v = self.values
         return float((v["set_before"] if t < v["set_at"][0] else v["set_after"])[0])
+
+    def messages(self, memory: Array, measured: Array) -> Array:
+        """Return what each line sends, (N, 4): its estimate, and its supply or set-point."""
+        was = Memory.of(memory)
+        shared = was.reference if self.control.law == "set_point" else measured[:, 1]
+        return np.column_stack([was.xhat, shared])
+
+    def loads(self, measured: Array) -> Array:
+        """Return IT powers over the nominal loads; 1 where it is not measured."""
+        load = measured[:, 2] / (self.own.size * self.line.P0)
+        return np.where(np.isnan(load), 1.0, load)
+
+    def waters(self, measured: Array) -> Array:
+        """Return θ of the facility water; 0 where it is not measured."""
+        water = measured[:, 4] - self.values["water0"][0]
+        return np.where(np.isnan(water), 0.0, water)
+
+    def ahead(self, load: Array, water: Array) -> Array:
+        """Return the v that holds the set-point at relative loads and water temperatures [W]."""
+        if not self.control.feedforward:
+            return np.zeros(len(load))
+        kappa, v = valve_curve(self.line)
+        supply = self.values["set_before"][0]
+        power = np.clip(load, 0.0, self.values["load_most"][0]) * self.line.P0
+        heat = self.line.released(power, supply)
+        drop = supply + heat / self.line.ws - water
+        enough = heat < kappa[-1] * drop
+        wanted = np.where(enough, heat / np.where(enough, drop, 1.0), kappa[-1])
+        return np.interp(wanted, kappa, v)
 
     def modes(self, t: float, silence: Array) -> Array:
         """Return the mode of each line, (N,)."""
@@ -206,9 +232,7 @@ class LineControllers:
     def estimates(self, x: Array, measured: Array, v: Array) -> Array:
         """Return the estimates at the next communication point, (N, 3)."""
         line, c = self.line, self.values
-        power, water = measured[:, 2], measured[:, 4]
-        load = np.where(np.isnan(power), 1.0, power / (self.own.size * line.P0)) - 1
-        warm = np.where(np.isnan(water), 0.0, water - c["water0"][0])
+        load, warm = self.loads(measured) - 1, self.waters(measured)
         kappa = self._kappa(
             np.clip(self.valve.y0 - self.valve.gain * v, self.own.low, self.own.high)
         )
@@ -234,30 +258,29 @@ class LineControllers:
         disagreement : (N, 4) array
         silence : (N, 2) array
             Of the neighbours and the leader [s].
-        memory : (N, 9) array
+        memory : (N, 10) array
 
         Returns
         -------
-        (N, 1), (N, 1), (N, 9) ndarray
+        (N, 1), (N, 1), (N, 10) ndarray
         """
         control, own, h, valve = self.control, self.own, self.h, self.valve
         was = Memory.of(memory)
         modes = self.modes(t, silence)
         starting = was.mode == START
-        supply, power = measured[:, 1], measured[:, 2]
+        supply = measured[:, 1]
         low, high = (valve.y0 - own.high) / valve.gain, (valve.y0 - own.low) / valve.gain
         feedback = (valve.y0 - measured[:, 3]) / valve.gain
         known = ~np.isnan(feedback)
         last = np.where(starting, np.clip(np.where(known, feedback, 0.0), low, high), was.last)
         stuck = known & (np.abs(feedback - last) * valve.gain > control.tolerance)
 
-        nominal = own.size * self.line.P0
-        power = np.where(np.isnan(power), nominal, power)
-        filtered = np.where(starting, power, was.power)
-        filtered = filtered - np.expm1(-h / control.feedforward_time) * (power - filtered)
-        p = filtered / nominal - 1
-        f1, f2, f3 = self.values["ff"]
-        forward = p * (f1 + p * (f2 + p * f3))
+        share = -np.expm1(-h / self.values["ff_time"][0])
+        load_now, water_now = self.loads(measured), self.waters(measured)
+        load = np.where(starting, load_now, was.load)
+        water = np.where(starting, water_now, was.water)
+        load, water = load + share * (load_now - load), water + share * (water_now - water)
+        forward = self.ahead(load, water)
 
         proportional, growth, acts = self.wishes(modes, t, supply, disagreement, was.reference)
         taken_over = (modes != was.mode) & (acts | ~starting)
@@ -288,7 +311,8 @@ class LineControllers:
             integral,
             np.where(overridden, dew, v),
             self.references(modes, supply, disagreement, was.reference),
-            filtered,
+            load,
+            water,
             v,
             modes.astype(float),
         )
@@ -297,7 +321,7 @@ class LineControllers:
         return v[:, None], applied[:, None], after.rows()
 
     def leader_step(self, t: float, memory: Array) -> Array:
-        """Return what the leader remembers next, (9,): the nominal line with a constant input."""
+        """Return what the leader remembers next, (10,): the nominal line with a constant input."""
         c = self.values
         held = c["rest"] + [0.0, 0.0, c["lift"][0] * (self.set_point(t) - self.line.theta_s0)]
         after = np.zeros_like(memory)
@@ -385,7 +409,7 @@ class CoolingLaw(CompiledLaw):
 
     def send(self, memory: Array, measured: Array) -> Array:
         """Return the message of each line."""
-        return messages(self.control, memory, measured)
+        return self.at(1.0).messages(memory, measured)
 
     def step(
         self,

@@ -196,6 +196,17 @@ class LineParameters:
         """Valve position of the operating point."""
         return self._position(self.kappa0, 1.0, f"P0 = {self.P0:g} W")
 
+    @property
+    def path(self) -> float:
+        """Plate above supply temperature per heat released, in a steady state [K/W]."""
+        return 1 / (2 * self.ws) + 1 / self.G
+
+    def released(self, P: ArrayLike, theta_s: float) -> Array:
+        """Heat with leakage [W] that a steady state at P [W] and a supply temperature releases."""
+        P = np.asarray(P, dtype=float)
+        leaked = self.kl * (theta_s - self.theta_p0)
+        return np.asarray(P * (1 + leaked) / (1 - P * self.kl * self.path))
+
     def position(self, P: float, theta_s: float | None = None, h: float = 1.0) -> float:
         """Valve position that holds a supply temperature at a constant load.
 
@@ -214,8 +225,7 @@ class LineParameters:
             If the line cannot do that with any valve position.
         """
         theta_s = self.theta_s0 if theta_s is None else theta_s
-        path = 1 / (2 * self.ws) + 1 / self.G  # K of the plate above the supply per W
-        released = P * (1 + self.kl * (theta_s - self.theta_p0)) / (1 - P * self.kl * path)
+        released = float(self.released(P, theta_s))
         kappa = released / (theta_s + released / self.ws)
         return self._position(kappa, h, f"P = {P:g} W, theta_s = {theta_s:g} K, h = {h:g}")
 

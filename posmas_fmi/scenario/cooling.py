@@ -11,7 +11,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cooling.classes import class_limit, dew_point
-from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, Control, controller
+from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, Control, controller, mean_delays
 from posmas_fmi.cooling.figures import facts, kpi_table, limits, verdicts
 from posmas_fmi.cooling.kpi import key_figures
 from posmas_fmi.cooling.law import CoolingLaw, team_network
@@ -52,9 +52,8 @@ RECORDED = (
     "facility_temperature",
 )
 TOLERANCE = 1e-6  # of the solver in the FMUs: some 1e-5 K, a thousandth of the sensors' noise
-# Integral time [s] of the integral law over its proportional part: stable with room to spare at
-# every period that a design certifies (benchmarks/cooling.py).
-INTEGRAL_TIME = 44.0
+# Integral time [s] of the integral law over its proportional part.
+INTEGRAL_TIME = mean_delays(NOMINAL)[1]
 
 
 def sizes(table: CoolingTable, lines: int) -> Array:

@@ -37,6 +37,21 @@ static double kappa(const Controller *c, double y)
     return 1 / ((a + b) / 2 + coth / c->UA);
 }
 
+/* The v that holds the set-point in the steady state that a load and a water temperature ask for:
+ * released heat over the drop to the water is the kappa that it takes. */
+static double forward(const Controller *c, double load, double water)
+{
+    const double high = c->kappa_low + (CURVE - 1) * c->kappa_step;
+    double power = clamp(load, 0, c->load_most) * c->nominal;
+    double heat = power * (1 + c->leakage * (c->set_before - c->plate0)) /
+                  (1 - power * c->leakage * c->path);
+    double drop = c->set_before + heat / c->ws - water;
+    double wanted = heat < high * drop ? fmax(heat / drop, c->kappa_low) : high;
+    double place = (wanted - c->kappa_low) / c->kappa_step;
+    int k = (int)fmin(place, CURVE - 2);
+    return c->curve[k] + (place - k) * (c->curve[k + 1] - c->curve[k]);
+}
+
 static void propagate(const Controller *c, const double *x, const double *held, double *next)
 {
     for (int i = 0; i < M; i++) {
@@ -46,11 +61,17 @@ static void propagate(const Controller *c, const double *x, const double *held, 
     }
 }
 
+/* IT power over the nominal load. */
+static double relative_load(const Controller *c, const double *own, const double *measured)
+{
+    return or_else(measured[POWER] / (own[OWN_SIZE] * c->nominal), 1);
+}
+
 /* The estimate at t + h: model with the measured load and the valve where it is, exact in A. */
 static void observe(const Controller *c, const double *own, const double *measured, double v,
                     const double *x, double *next)
 {
-    double load = or_else(measured[POWER] / (own[OWN_SIZE] * c->nominal), 1) - 1;
+    double load = relative_load(c, own, measured) - 1;
     double water = or_else(measured[WATER] - c->water0, 0);
     double held[M] = {load * c->heating * (1 + c->leakage * (x[X_PLATE] - c->plate0)), 0, 0};
     double y = clamp(c->y0 - c->gain * v, own[OWN_LOW], own[OWN_HIGH]), k = kappa(c, y);
@@ -130,20 +151,22 @@ void controller_step(const Controller *c, const double *own, double t, const dou
     const double last = was == MODE_START ? clamp(or_else(feedback, 0), low, high) : memory[MEM_LAST];
     const int stuck = fabs(feedback - last) * c->gain > c->tolerance; /* not if it is NaN */
 
-    /* Feedforward of the filtered IT power. */
-    const double measured_power = or_else(measured[POWER], own[OWN_SIZE] * c->nominal);
-    double power = was == MODE_START ? measured_power : memory[MEM_POWER];
-    power -= expm1(-c->h / c->ff_time) * (measured_power - power);
-    const double p = power / (own[OWN_SIZE] * c->nominal) - 1;
-    const double forward = p * (c->ff[0] + p * (c->ff[1] + p * c->ff[2]));
+    /* Feedforward of the filtered IT power and water temperature. */
+    const double share = -expm1(-c->h / c->ff_time), load_now = relative_load(c, own, measured),
+                 water_now = or_else(measured[WATER] - c->water0, 0);
+    double load = was == MODE_START ? load_now : memory[MEM_LOAD];
+    double water = was == MODE_START ? water_now : memory[MEM_WATER];
+    load += share * (load_now - load);
+    water += share * (water_now - water);
+    const double ahead = c->forward > 0 ? forward(c, load, water) : 0;
 
     /* The law; a change of mode is bumpless. */
     const double reference = memory[MEM_REFERENCE];
     const Wish w = wish(c, own, mode, t, measured, disagreement, reference);
     double integral = memory[MEM_INTEGRAL];
     if (mode != was && (was != MODE_START || w.integral > 0))
-        integral = last - w.proportional - forward;
-    const double wanted = w.proportional + integral + forward;
+        integral = last - w.proportional - ahead;
+    const double wanted = w.proportional + integral + ahead;
 
     /* Dew point: the larger of two controllers; the override waits at what was applied. */
     const double too_cold = c->floor - supply;
@@ -158,7 +181,7 @@ void controller_step(const Controller *c, const double *own, double t, const dou
     /* The integral follows what really happens. */
     const double real = stuck ? feedback : v;
     if (mode == MODE_MANUAL)
-        integral = v - w.proportional - forward;
+        integral = v - w.proportional - ahead;
     else if (w.integral > 0)
         integral += c->h * w.growth + fmin(c->h / c->tracking, 1) * (real - wanted);
     else
@@ -170,7 +193,8 @@ void controller_step(const Controller *c, const double *own, double t, const dou
                         ? clamp(memory[MEM_DEW] + c->h * c->kp / c->Ti * too_cold, low, high)
                         : v;
     next[MEM_REFERENCE] = next_reference(c, own, mode, measured, disagreement, reference);
-    next[MEM_POWER] = power;
+    next[MEM_LOAD] = load;
+    next[MEM_WATER] = water;
     next[MEM_LAST] = v;
     next[MEM_MODE] = mode;
     u[0] = v;

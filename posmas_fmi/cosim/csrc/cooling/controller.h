@@ -18,10 +18,11 @@ enum {
     P = 1,          /* v [W] */
     Q = 2,          /* y: return, supply [K] */
     MEASURED = 5,   /* y, IT power [W], valve position, facility water [K]; NaN: not measured */
-    MEMORY = 9,
+    MEMORY = 10,
     MESSAGE = 4,    /* xhat, and what is shared: the supply temperature or an estimate of the set-point */
     INNOVATION = 0,
-    OWN = 8
+    OWN = 8,
+    CURVE = 129
 };
 
 enum { /* of Controller.law */
@@ -48,7 +49,8 @@ enum { /* of memory, after xhat */
     MEM_INTEGRAL = M, /* [W] */
     MEM_DEW,          /* [W] integral of the override */
     MEM_REFERENCE,    /* [K] estimate of the set-point, or what the neighbours agreed on */
-    MEM_POWER,        /* [W] filtered IT power */
+    MEM_LOAD,         /* filtered IT power over the nominal load */
+    MEM_WATER,        /* [K] filtered temperature of the facility water */
     MEM_LAST,         /* [W] what was applied last */
     MEM_MODE
 };
@@ -65,8 +67,11 @@ typedef struct {
     double K_q;           /* [W/(K s)] of its integral */
     double consensus;     /* [1/s] of the set-points */
     double kp, Ti;        /* PI: [W/K], [s] */
-    double ff[3];         /* [W] of p, p^2, p^3; p: relative deviation of the filtered power */
-    double ff_time;       /* [s] */
+    /* feedforward: 1 or 0, its filter [s], largest load it is for, over the nominal one */
+    double forward, ff_time, load_most;
+    double path;          /* [K/W] plate above supply, per released heat */
+    double kappa_low, kappa_step; /* [W/K] */
+    double curve[CURVE];  /* [W] v that gives kappa_low, kappa_low + kappa_step, ... */
     /* shell */
     double tracking;      /* [s] of the back-calculation, and of forgetting where there is no integral */
     double rate;          /* valve [1/s] */
