@@ -78,6 +78,9 @@ class Agent:
     region : mapping, optional
         ``name -> (low, high)`` for ``t, x1, …``; where the bounds are examined. A missing state
         ranges over [0, inf), a missing time too, an input over all reals.
+    slope : (float, float), optional
+        Proved bounds of the slope of sec on the region, where who makes the agent knows some: for
+        integral action. Without them the expressions are examined.
 
     Raises
     ------
@@ -100,6 +103,7 @@ class Agent:
     sector: tuple[float, float] = (1.0, 1.0)
     lipschitz: float | Sequence[float] | None = None
     region: Mapping[str, tuple[float, float]] = attrs.field(factory=dict)
+    slope: tuple[float, float] | None = None
 
     def __attrs_post_init__(self) -> None:
         found = [*_matrix_errors(self), *_bound_errors(self)]

@@ -268,8 +268,12 @@ def _show_design(made: Design, as_json: bool) -> int:
         print(f"observer      {_number(certificate.observer_rate)} 1/s")
         print(f"non-negative  {'proved' if certificate.positive else 'not proved'}")
         for condition in certificate.conditions:
-            mark = "holds" if condition.holds else "FAILS"
-            print(f"  {mark}  {condition.name} (margin {_number(condition.margin)})")
+            mark = "holds" if condition.holds else "REFUTED" if condition.refuted else "not proved"
+            print(f"  {mark:10}  {condition.name} (margin {_number(condition.margin)})")
+            if not condition.holds:
+                print(
+                    f"              {'; '.join(filter(None, (condition.proof, condition.detail)))}"
+                )
         for note in made.notes:
             print(f"  note: {note}")
     return DONE if made.certificate.certified != "no" else NEGATIVE
@@ -326,11 +330,15 @@ def _show_linearisation(made: Linearisation) -> None:
 def _certified(made: Design) -> str:
     certificate = made.certificate
     if certificate.certified == "conditional":
-        open_ = [a for a in certificate.assumptions if a.status != "verified"]
-        words = "; ".join(f"{a.name} {a.status}: {a.detail}" for a in open_)
-        return f"conditional ({words})"
+        words = (f"{a.name} {a.status}: {a.detail}" for a in certificate.open_assumptions)
+        return f"conditional ({'; '.join(words)})"
     if certificate.certified == "no":
-        return f"no ({'; '.join(c.name for c in certificate.failing)})"
+        parts = []
+        for word, way in (("refuted", True), ("neither proved nor refuted", False)):
+            names = [c.name for c in certificate.failing if c.refuted is way]
+            if names:
+                parts.append(f"{word}: {', '.join(names)}")
+        return f"no ({'; '.join(parts)})"
     return certificate.certified
 
 

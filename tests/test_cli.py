@@ -57,7 +57,7 @@ def test_certify_judges_given_gains(tmp_path, capsys):
     assert printed["K"] == [[-0.441, -0.441]]
     gains.write_text('{"K": [[0.441, 0.441]], "E": [[0.0, 9.0], [0.0, 9.0]]}')
     assert main(["certify", "paper_example_1", "--gains", str(gains)]) == 1
-    assert "FAILS" in capsys.readouterr().out
+    assert "REFUTED" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

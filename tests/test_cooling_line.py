@@ -197,6 +197,20 @@ def test_the_slope_sector_encloses_and_is_tight(header: tuple[float, float]) -> 
     assert high >= 22 * slope.max() >= high * 0.96
 
 
+def test_the_slope_of_the_written_line_is_enclosed_also_where_its_text_has_a_kink() -> None:
+    agent = line_agent(LINE, theta_r=(14.0, 16.0), opening=(0.3, 1.0))
+    assert agent.slope is not None
+    valve = valve_mapping(LINE, (0.3, 1.0))
+    # both streams of the exchanger are equal where cw wmax kv = ws
+    y = np.linspace(0.3, 1.0, 200001)
+    per_cold = LINE.ws / (LINE.cw * LINE.wmax * LINE.kv(y))
+    kink = valve.retained(float(y[np.abs(per_cold - 1).argmin()]))
+    for u in (np.linspace(*valve.inputs, 5001), np.linspace(kink - 100, kink + 100, 5001)):
+        values = agent.sec_numpy(u[:, None])[:, 0]
+        slopes = np.diff(values) / np.diff(u)
+        assert agent.slope[0] < slopes.min() < slopes.max() < agent.slope[1]
+
+
 @pytest.mark.parametrize(
     ("opening", "header"), [((0.5, 0.5), (1, 1)), ((-0.1, 1), (1, 1)), ((0, 1), (0, 1))]
 )

@@ -9,11 +9,13 @@ import pytest
 from scipy.linalg import expm
 
 from posmas_fmi.agent import Agent, linear_agent
+from posmas_fmi.certify import Loop
+from posmas_fmi.certify.diverging import divergence
 from posmas_fmi.cli import main
 from posmas_fmi.cooling.line import LineParameters
-from posmas_fmi.cooling.mapping import line_agent, slope_sector
+from posmas_fmi.cooling.mapping import line_agent
 from posmas_fmi.design import DesignSettings, certify, design
-from posmas_fmi.design.integral import augmented, integral_design
+from posmas_fmi.design.integral_gains import augmented, integral_design
 from posmas_fmi.design.lmi import graph_scalar
 from posmas_fmi.errors import DesignError, InputError
 from posmas_fmi.network import Network, network_from_arcs
@@ -85,9 +87,10 @@ def test_wrong_shape_of_what_is_integrated() -> None:
 
 def cooling() -> Agent:
     """Lines whose leakage does not depend on the temperature, valves from 40 % on."""
-    line, opening = attrs.evolve(LineParameters(), kl=0.0), (0.4, 1.0)
-    sector = slope_sector(line, (10.0, 22.0), opening)
-    return attrs.evolve(line_agent(line, opening=opening), sector=sector)
+    line = attrs.evolve(LineParameters(), kl=0.0)
+    agent = line_agent(line, theta_r=(10.0, 22.0), opening=(0.4, 1.0))
+    assert agent.slope is not None
+    return attrs.evolve(agent, sector=agent.slope)
 
 
 def rows_of_lines(count: int, row: int = 10) -> Network:
@@ -108,8 +111,9 @@ def test_a_thousand_cooling_lines_are_proved_with_small_programs() -> None:
         assert made.K_q is not None
         assert (made.K_q < 0).all()
         assert made.certificate.failing == ()
-        assert made.certificate.certified == "conditional"
-        assert {a.name for a in made.certificate.open_assumptions} == {"slope"}
+        assert made.certificate.certified == "yes"
+        slope = next(a for a in made.certificate.assumptions if a.name == "slope")
+        assert "closed form" in slope.detail
         names = [c.name for c in made.certificate.conditions]
         assert "I: sampled loop contracts" in names
         assert made.certificate.rate is not None
@@ -156,6 +160,45 @@ def test_given_integral_gains_are_certified_and_bad_ones_are_not() -> None:
     for bad in (("y3",), ("y1", "y2")):
         with pytest.raises(InputError, match="integrates"):
             design(agent, network, DesignSettings(method="integral", integrates=bad), 5.0)
+
+
+TANK = linear_agent([[-0.1]], [[1.0]], [[1.0]], sector=(0.8, 1.2))
+PAIR = network_from_arcs(2, [(1, 2), (2, 1)], [1])
+
+
+@pytest.mark.parametrize(
+    ("K_q", "certified", "refuted"),
+    [(-0.001, "yes", False), (-0.3, "no", False), (-2.5, "no", True), (0.01, "no", True)],
+)
+def test_what_is_refuted_is_told_from_what_is_only_not_proved(
+    K_q: float, certified: str, refuted: bool
+) -> None:
+    made = certify(TANK, PAIR, [[-0.3]], [[1.0]], DesignSettings(), 0.5, [[K_q]])  # type: ignore[arg-type]
+    assert (made.certificate.certified, made.certificate.refuted) == (certified, refuted)
+    if refuted:
+        (failed,) = made.certificate.failing
+        assert "does not converge" in failed.proof
+        A, held = np.exp(-0.05), (1 - np.exp(-0.05)) / 0.1
+        M = PAIR.pinned_laplacian.toarray()
+        T = np.kron(np.eye(2), [[A, 0.0], [0.5, 1.0]])
+        T += 1.2 * np.kron(M, np.outer([held, 0.0], [-0.3, K_q]))
+        assert np.abs(np.linalg.eigvals(T)).max() >= 1 - failed.margin > 1
+    elif certified == "no":
+        assert [c.proof for c in made.certificate.failing] == [
+            "the search found no quadratic function"
+        ]
+
+
+def test_a_design_that_is_only_good_in_continuous_time_is_not_taken() -> None:
+    """At a period of 2 s the gains for the fastest rates make the sampled loop diverge."""
+    made = design(TANK, PAIR, DesignSettings(method="integral"), 2.0)
+    assert made.K_q is not None
+    loop = Loop(TANK, PAIR, made.K, made.E, period=2.0)
+    assert divergence(loop, np.hstack([made.K, made.K_q]), np.eye(1)) is None
+    fast = integral_design(TANK, graph_scalar(PAIR, TANK.sector), np.eye(1), rate=0.5)
+    found = divergence(loop, np.hstack([fast.K, fast.K_q]), np.eye(1))
+    assert found is not None
+    assert found.factor > 1
 
 
 def test_the_integral_design_is_chosen_in_a_scenario(

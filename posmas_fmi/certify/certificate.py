@@ -166,7 +166,10 @@ class Certificate:
 
     @property
     def certified(self) -> Verdict:
-        """``"no"`` if a condition fails, ``"conditional"`` if an assumption is not verified."""
+        """``"no"`` if a condition is not proved, ``"conditional"`` if an assumption is open.
+
+        `refuted` tells the two kinds of ``"no"`` apart.
+        """
         if not self.conditions or not all(c.holds for c in self.conditions):
             return "no"
         return "yes" if all(a.status == "verified" for a in self.assumptions) else "conditional"
@@ -175,6 +178,11 @@ class Certificate:
     def failing(self) -> tuple[Condition, ...]:
         """Conditions that do not hold."""
         return tuple(c for c in self.conditions if not c.holds)
+
+    @property
+    def refuted(self) -> bool:
+        """Whether a condition is proved not to hold; otherwise ``"no"`` means not proved."""
+        return any(c.refuted for c in self.conditions)
 
     @property
     def open_assumptions(self) -> tuple[Assumption, ...]:
@@ -186,6 +194,7 @@ class Certificate:
         region = self.region_of_attraction
         return {
             "certified": self.certified,
+            "refuted": self.refuted,
             "assumptions": [attrs.asdict(a) for a in self.assumptions],
             "rate": json_number(self.rate),
             "observer_rate": json_number(self.observer_rate),

@@ -14,6 +14,7 @@ from posmas_fmi.certify.band import guaranteed_band
 from posmas_fmi.certify.certificate import Certificate, Condition, Delayed
 from posmas_fmi.certify.contraction import Rate, continuous_rate
 from posmas_fmi.certify.delay import delayed_rates, statement
+from posmas_fmi.certify.diverging import divergence
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Feedback, Loop
 from posmas_fmi.certify.positivity import between_samples, gain_sign, metzler, non_positive_gain
@@ -66,7 +67,7 @@ def certify_loop(
         *observer.signs,
         *controller.signs,
         observer.contracts,
-        controller.contracts,
+        _or_refuted(controller.contracts, loop),
     )
     holds = all(c.holds for c in conditions)
     delays: tuple[Delayed, ...] = ()
@@ -172,6 +173,16 @@ class Prover:
         if self.positive:
             return sampled_factor(self.flow, self.feedback, self.loop.period)
         return general.sampled_factor(self.loop, self.feedback.name, self.weights)
+
+
+def _or_refuted(condition: Condition, loop: Loop) -> Condition:
+    """Look for a loop that diverges, where contraction is neither proved nor refuted."""
+    if condition.holds or condition.refuted:
+        return condition
+    found = divergence(loop, loop.phi * loop.K)
+    if found is None:
+        return condition
+    return attrs.evolve(condition, refuted=True, proof=f"{condition.proof}; {found}")
 
 
 def m_matrix(network: Network, weights: Weights) -> Condition:

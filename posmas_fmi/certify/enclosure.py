@@ -41,6 +41,13 @@ def point(value: Any) -> Interval:
     return Interval(array, array)
 
 
+def middle(M: Interval) -> tuple[Array, float]:
+    """Middle of a matrix, and a bound of the Frobenius norm of what is left."""
+    centre = 0.5 * (M.low + M.high)
+    radius = np.maximum(M.high - centre, centre - M.low)
+    return centre, float(np.linalg.norm(radius)) * (1 + 1e-9) + _UNDERFLOW
+
+
 def matmul(a: Interval, b: Interval) -> Interval:
     """Matrix product over the last two axes; leading axes broadcast."""
     total = _column(a, 0) * _row(b, 0)

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import attrs
 import numpy as np
 
-from posmas_fmi.certify.enclosure import matmul, typed
+from posmas_fmi.certify.enclosure import matmul, middle, typed
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Loop
 from posmas_fmi.certify.proof import (
@@ -253,8 +253,8 @@ def step_of(loop: Loop, C_z: Array | None = None) -> Step | None:
         return None
     Phi, Gamma = _period(loop, h)
     held = matmul(Gamma, typed(loop.agent.B))
-    A, loose = _middle(Phi)
-    B, loose_input = _middle(held)
+    A, loose = middle(Phi)
+    B, loose_input = middle(held)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         return None
     m = loop.agent.m
@@ -280,13 +280,6 @@ def _period(loop: Loop, h: float) -> tuple[Interval, Interval]:
         Interval(plain.low - spread * _UP, plain.high + spread * _UP),
         Interval(held.low - spread_held * _UP, held.high + spread_held * _UP),
     )
-
-
-def _middle(M: Interval) -> tuple[Array, float]:
-    """Middle, and a bound of the norm of what is left."""
-    middle = 0.5 * (M.low + M.high)
-    radius = np.maximum(M.high - middle, middle - M.low) * _UP
-    return middle, float(np.linalg.norm(radius)) * _UP
 
 
 def sampled_matrix(
@@ -395,7 +388,7 @@ def prove_observer(loop: Loop, factor: float) -> SampledProof | None:
     if not np.isfinite(loop.H_ell.high).all():
         return None
     Phi, Gamma = _period(loop, loop.period)
-    F, loose = _middle(Phi + -matmul(Gamma, loop.EC))
+    F, loose = middle(Phi + -matmul(Gamma, loop.EC))
     if not np.isfinite(F).all() or np.abs(np.linalg.eigvals(F)).max() >= factor:
         return None
     P = solve_discrete_lyapunov((F / factor).T, np.eye(len(F)))

@@ -11,6 +11,10 @@ from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.errors import InputError
 from posmas_fmi.interval import Interval
 
+# coth has a pole where both streams of the exchanger are equal, κ does not: there the text of an
+# agent holds |q|/2 at this value, which changes κ by less than 1e-6 of itself. Enclosures hold for
+# both.
+POLE = 1e-3
 _BOXES = (2048, 64)  # over y and h: the enclosure is wider than the range by 2 to 3 %
 _OWN_ULPS = 4096  # x coth x and its slope lose this much where the closed form meets the series
 
@@ -61,9 +65,14 @@ def kappa_slope_range(
     per_cold, per_hot = (flow * kv).reciprocal(), _point(line.ws).reciprocal()
     x = _point(line.UA / 2) * (per_hot + -per_cold)
     size = Interval(np.maximum(np.maximum(x.low, -x.high), 0.0), np.maximum(-x.low, x.high))
+    held = size.low <= POLE
+    size = Interval(size.low, np.maximum(size.high, POLE))
     even = size.monotone(x_coth_x, 1.0, math.inf).widen(_OWN_ULPS)
     odd = x.monotone(x_coth_x_slope, -1.0, 1.0)
-    odd = Interval(odd.low - _OWN_ULPS * 2.0**-52, odd.high + _OWN_ULPS * 2.0**-52)
+    low, high = odd.low - _OWN_ULPS * 2.0**-52, odd.high + _OWN_ULPS * 2.0**-52
+    odd = Interval(
+        np.where(held, np.minimum(low, 0.0), low), np.where(held, np.maximum(high, 0.0), high)
+    )
     half = _point(0.5)
     kappa = (half * (per_hot + per_cold) + even * _point(line.UA).reciprocal()).reciprocal()
     by_cold = (kappa * per_cold).power(2) * half * (_point(1.0) + -odd)

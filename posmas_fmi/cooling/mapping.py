@@ -10,7 +10,7 @@ import numpy as np
 import sympy
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.cooling.enclosure import kappa_slope_range
+from posmas_fmi.cooling.enclosure import POLE, kappa_slope_range
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import VectorFunction, parse, symbol
@@ -18,9 +18,6 @@ from posmas_fmi.interval import bounds
 
 LOADS = (40e3, 130e3)  # W, per line of 80 kW nominal
 
-# coth has a pole where both streams of the exchanger are equal, κ does not: there |q|/2 is held at
-# this value, which changes κ by less than 1e-6 of itself and keeps its enclosures finite.
-_POLE = 1e-3
 _NEAR = 0.02  # in valve position: closer to y0 the slope encloses the secant
 
 
@@ -212,6 +209,8 @@ def line_agent(
 ) -> Agent:
     """Return the line as an agent of model (1), for design and certificates.
 
+    Its `slope` is `slope_sector`, for method "integral".
+
     ``x = [θp, θr, θs]`` in kelvin above the facility supply, ``y = [θr, θs]``, u the heat
     retained [W], ``sec(u) = -(κ(y0 - gain·u) - κ0) θr`` written for the nominal θr; for the true
     θr(t) it is a time-varying sector gain, and `sector` covers all of the range. Load and leakage
@@ -242,6 +241,7 @@ def line_agent(
     theta_r = return_range(line, loads) if theta_r is None else theta_r
     low, high = sector(line, theta_r, opening)
     own_low, own_high = sector(line, (line.theta_r0, line.theta_r0), opening)
+    with_own = min(theta_r[0], line.theta_r0), max(theta_r[1], line.theta_r0)
     valve = valve_mapping(line, opening)
     g, sec = line_texts(line, opening)
     # H carries kl P0/Cp, so that g has slope P/P0 in θp; P0/kl - θp0 is the load without leakage
@@ -256,6 +256,7 @@ def line_agent(
         sector=(min(low, own_low), max(high, own_high)),
         lipschitz=[max(1.0, loads[1] / line.P0), 0.0, 0.0] if line.kl > 0 else None,
         region={"u1": valve.inputs},
+        slope=slope_sector(line, with_own, opening),
     )
 
 
@@ -272,5 +273,5 @@ def _kappa_text(line: LineParameters, y: str) -> str:
     """κ over the valve position, in the language of expressions."""
     resistance = f"sqrt({line.N!r}*{line.R!r}**(2 - 2*({y})) + {1 - line.N!r})"
     per_cold = f"({1 / (line.cw * line.wmax)!r}*{resistance})"
-    x = f"max(abs({line.UA / 2!r}*({1 / line.ws!r} - {per_cold})), {_POLE!r})"
+    x = f"max(abs({line.UA / 2!r}*({1 / line.ws!r} - {per_cold})), {POLE!r})"
     return f"(1/(({1 / line.ws!r} + {per_cold})/2 + {x}/tanh({x})/{line.UA!r}))"

@@ -25,7 +25,7 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
     list of dict
         ``what``, ``covered`` (bool) and ``why``. Empty: nothing beyond the nominal loop.
     """
-    proved = designed.certificate.certified != "no"
+    proved = bool(designed.certificate.delays)
     rows: list[tuple[str, bool, str]] = []
     if scenario.control.python is not None:
         rows.append(
@@ -80,6 +80,8 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
 def _delays(designed: Design) -> str:
     if designed.certificate.certified == "no":
         return "nothing is proved"
+    if not designed.certificate.delays:
+        return "what is proved is the loop without delay; certificate D is not proved"
     slower = [f"{d.rate:.3g} 1/s at {d.delay:.3g} s" for d in designed.certificate.delays[::3]]
     rates = f"; certified rate {', '.join(slower)}" if slower else ""
     stays = "convergence and positivity stay"
