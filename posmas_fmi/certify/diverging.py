@@ -82,6 +82,8 @@ def _periods(loop: Loop, gain: Array, C_z: Array | None) -> Iterator[tuple[float
     flow, _, held, _ = Flow(loop.A, loop.A).over(h)
     A, loose = middle(flow)
     B, loose_input = middle(matmul(held, typed(agent.B)))
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        return
     if C_z is not None:
         k = len(C_z)
         A = np.block([[A, np.zeros((agent.m, k))], [h * C_z, np.eye(k)]])
@@ -108,7 +110,7 @@ def growth(T: Array, loose: float = 0.0) -> float | None:
     """
     from scipy.linalg import solve_discrete_lyapunov
 
-    if not np.isfinite(T).all():
+    if not (np.isfinite(T).all() and math.isfinite(loose)):
         return None
     radius = float(np.abs(np.linalg.eigvals(T)).max())
     if not radius > 1 + 1e-9:

@@ -42,9 +42,10 @@ def point(value: Any) -> Interval:
 
 
 def middle(M: Interval) -> tuple[Array, float]:
-    """Middle of a matrix, and a bound of the Frobenius norm of what is left."""
-    centre = 0.5 * (M.low + M.high)
-    radius = np.maximum(M.high - centre, centre - M.low)
+    """Middle of a matrix, and a bound of the Frobenius norm of what is left; NaN where infinite."""
+    with np.errstate(invalid="ignore"):
+        centre = 0.5 * (M.low + M.high)
+        radius = np.maximum(M.high - centre, centre - M.low)
     return centre, float(np.linalg.norm(radius)) * (1 + 1e-9) + _UNDERFLOW
 
 
