@@ -206,6 +206,8 @@ def unfit(system: System) -> str:
     """Return why the engine cannot run a system; empty if it can."""
     if len(system.stages) > 1 or system.iteration is not None:
         return "the engine steps all FMUs at once; other ways of coupling run with numpy"
+    if system.wiring.extrapolates:
+        return "derivatives of inputs that are connected are computed with numpy"
     return ""
 
 

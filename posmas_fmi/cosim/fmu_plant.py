@@ -240,8 +240,11 @@ class FmuPlant:
         for number, begin, length in zip(which, t, h, strict=True):
             instance, ports = self._instances[number], self._specs[number].inputs
             at = slice(self.input_at[number], self.input_at[number + 1])
-            values = inputs[at] * np.array(ports.scale) + np.array(ports.offset)
+            given, rates = np.split(inputs[at], [len(ports.variables)])
+            values = given * np.array(ports.scale) + np.array(ports.offset)
             instance.write(instance.file.ports(ports.variables), values)
+            if ports.rates:
+                instance.set_input_derivatives(instance.file.ports(ports.rates), rates)
             instance.do_step(float(begin), float(length))
 
     def _freeze(self, time: float, readings: Array, before: Array) -> None:

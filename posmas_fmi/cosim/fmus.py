@@ -40,6 +40,8 @@ class PortMap:
         to be taken as it is.
     place : str
         Where in the scenario they are declared.
+    rates : tuple of str
+        Inputs beside these whose derivative follows: how they go on during a step (FMI 2).
     """
 
     variables: tuple[str, ...]
@@ -47,6 +49,7 @@ class PortMap:
     offset: tuple[float, ...]
     units: tuple[str | None, ...]
     place: str
+    rates: tuple[str, ...] = ()
 
     @classmethod
     def plain(cls, variables: Sequence[str], place: str = "") -> PortMap:
@@ -61,12 +64,20 @@ class PortMap:
             self.offset + other.offset,
             self.units + other.units,
             self.place,
+            self.rates + other.rates,
         )
+
+    @property
+    def width(self) -> int:
+        """Number of values, rates included."""
+        return len(self.variables) + len(self.rates)
 
     def values_of(self, values: Array) -> dict[str, float]:
         """Return what protocol values are to the FMU, by variable."""
-        ports = zip(self.variables, values, self.scale, self.offset, strict=True)
-        return {name: float(v * scale + offset) for name, v, scale, offset in ports}
+        ports = zip(self.variables, values, self.scale, self.offset, strict=False)
+        found = {name: float(v * scale + offset) for name, v, scale, offset in ports}
+        rates = zip(self.rates, values[len(self.variables) :], strict=True)
+        return found | {f"der({name})": float(value) for name, value in rates}
 
     @property
     def converts(self) -> bool:
@@ -100,6 +111,10 @@ class _Binding(ctypes.Structure):
         ("real_status", _pointer),
         ("inputs", _Ports),
         ("readings", _Ports),
+        ("set_rates", _pointer),
+        ("rate_references", _pointer),
+        ("rate_orders", _pointer),
+        ("n_rates", _int),
     )
 
 
@@ -138,7 +153,10 @@ class Report(ctypes.Structure):
     _fields_ = (("failure", Incident), ("warning", Incident), ("warnings", _int))
 
 
-_CALLS = ("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep", "")
+_CALLS = (
+    *("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep", ""),
+    "SetRealInputDerivatives",
+)
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
 DIED, DEADLINE, INTERRUPTED = 8, 9, 10  # of an FMU in another process
 
@@ -288,7 +306,7 @@ class Fmus:
             [self._component(*kind, i) for kind, i in zip(kinds, instances, strict=True)],
             dtype=np.uintp,
         )
-        self.input_at = _starts([len(ports.variables) for ports in inputs])
+        self.input_at = _starts([ports.width for ports in inputs])
         self.reading_at = _starts([len(ports.variables) for ports in readings])
         self._keep += [bindings, places]
         rooms = [max(b.inputs.n_values, b.readings.n_values) for b in bindings]
@@ -341,6 +359,7 @@ class Fmus:
             return _Binding(
                 *(3, served.get, served.set, served.do_step, None, None),
                 *(self._served_ports(file, ports) for ports in (inputs, readings)),
+                *self._served_rates(file, inputs.rates),
             )
         prefix, real = f"fmi{file.version}", "Real" if file.version == 2 else "Float64"
         return _Binding(
@@ -351,7 +370,27 @@ class Fmus:
             *(_optional(file, name) for name in ("fmi2GetBooleanStatus", "fmi2GetRealStatus")),
             self._c_ports(file.ports(inputs.variables), inputs),
             self._c_ports(file.ports(readings.variables), readings),
+            *self._rates(file, inputs.rates),
         )
+
+    def _rates(self, file: FmuFile, names: tuple[str, ...]) -> tuple[int | None, ...]:
+        """How input derivatives are set."""
+        if not names:
+            return None, None, None, 0
+        n = len(names)
+        references = (ctypes.c_uint32 * n)(*(file.variable(name).reference for name in names))
+        orders = (ctypes.c_int32 * n)(*[1] * n)
+        self._keep += [references, orders]
+        places = ctypes.addressof(references), ctypes.addressof(orders)
+        return file.address("fmi2SetRealInputDerivatives"), *places, n
+
+    def _served_rates(self, file: FmuFile, names: tuple[str, ...]) -> tuple[int | None, ...]:
+        """How Python sets them: their number stands for all."""
+        if not names:
+            return None, None, None, 0
+        reference = (ctypes.c_uint32 * 1)(self._served.number(file.ports(names)))
+        self._keep.append(reference)
+        return self._served.set_rates, ctypes.addressof(reference), None, len(names)
 
     def _c_ports(self, ports: Ports, port_map: PortMap) -> _Ports:
         n = len(ports.names)
@@ -464,7 +503,7 @@ class Fmus:
         instance = self._instances[incident.instance]
         instance.time = time
         function = _CALLS[incident.call]
-        if function != "DoStep":
+        if function in ("Get", "Set"):
             function += "Real" if instance.file.version == 2 else "Float64"
         messages: Sequence[str] = instance.messages
         if self.is_remote(incident.instance):

@@ -353,6 +353,8 @@ class Run:
             inputs=np.zeros(plant.input_at[-1]),
         )
         self.drive = np.zeros(0)  # the exogenous signals at k
+        self.before: Array | None = None  # readings at k - 1
+        self.ahead = np.zeros(plant.reading_at[-1], dtype=bool)  # known (or guessed) at k + 1
         self.conditions = self.timeline.at(0)
         self.exact_sensors = self.exact_actuators = True
         self.weights = self._weights()
@@ -526,6 +528,11 @@ class Run:
 
     def _step(self, k: int) -> None:
         """Set the inputs of the instances whose step begins; step those whose step ends."""
+        before = self.state.readings
+        self._take_step(k)
+        self.before = before
+
+    def _take_step(self, k: int) -> None:
         system, state = self.system, self.state
         if system.iteration is None:
             state.readings = self._step_once(k, state.readings.copy())
@@ -538,7 +545,7 @@ class Run:
         # readings at the end of the step are guesses until the inputs made of them confirm them
         for _ in range(system.iteration.most):
             self.plant.restore(saved)
-            guess, latest = latest, self._step_once(k, latest.copy())
+            guess, latest = latest, self._step_once(k, latest.copy(), guessed=True)
             change = _change(latest, guess)
             if change <= tolerance:
                 break
@@ -563,9 +570,10 @@ class Run:
             )
         return again
 
-    def _step_once(self, k: int, latest: Array) -> Array:
+    def _step_once(self, k: int, latest: Array, guessed: bool = False) -> Array:
         """Step stage after stage; inputs are made of `latest`, which is brought up to date."""
         system, state, clock = self.system, self.state, self.system.clock
+        self.ahead[:] = guessed
         for stage in system.stages:
             begins = ends = stage
             if not self._all_act:
@@ -582,6 +590,9 @@ class Run:
                 ends = ends[~self.plant.frozen[ends]]  # some may have failed in this very step
             self.plant.read(ends, clock.time(k + 1), latest)
             state.k = k
+            if system.wiring.extrapolates:
+                for i in ends:
+                    self.ahead[self.plant.reading_at[i] : self.plant.reading_at[i + 1]] = True
         return latest
 
     def _set_inputs(self, which: Whole, readings: Array) -> None:
@@ -591,11 +602,20 @@ class Run:
             return
         values = np.empty(at[-1])
         values[self.u_at] = state.actuated
-        values[self.extra_at] = self.system.wiring.inputs(readings, self.drive)
+        values[self.extra_at] = self._extra_inputs(readings)
         chosen = np.zeros(len(at) - 1, dtype=bool)
         chosen[which] = True
         mine = np.repeat(chosen, np.diff(at))
         state.inputs = np.where(mine, values, state.inputs)
+
+    def _extra_inputs(self, latest: Array) -> Array:
+        wiring, begin = self.system.wiring, self.state.readings
+        if not wiring.extrapolates:
+            return wiring.inputs(latest, self.drive)
+        # over the step where its end is known, else as over the one before
+        before = begin if self.before is None else self.before
+        change = np.where(self.ahead, latest - begin, begin - before)
+        return wiring.inputs(latest, self.drive, begin, change / self.system.clock.h)
 
     def _remember(self, t: float, k: int) -> None:
         state, system = self.state, self.system

@@ -24,6 +24,7 @@ _key, _references = ctypes.c_void_p, ctypes.POINTER(ctypes.c_uint32)
 _values, _flag = ctypes.POINTER(_double), ctypes.POINTER(_bool)
 _Exchange = ctypes.CFUNCTYPE(_int, _key, _references, _size, _values, _size)
 _Step = ctypes.CFUNCTYPE(_int, _key, _double, _double, _bool, _flag, _flag, _flag, _values)
+_Rates = ctypes.CFUNCTYPE(_int, _key, _references, _size, ctypes.c_void_p, _values)
 _OK, _ERROR = 0, 3
 
 
@@ -37,7 +38,7 @@ class Served:
 
     Attributes
     ----------
-    get, set, do_step : int
+    get, set, do_step, set_rates : int
         Addresses of the functions.
     """
 
@@ -77,8 +78,13 @@ class Served:
 
             return guarded(key, go)
 
-        self._functions = _Exchange(get), _Exchange(set_), _Step(do_step)
-        self.get, self.set, self.do_step = (
+        def set_rates(key: int | None, references: Any, n: int, _: Any, values: Any) -> int:
+            rates = np.ctypeslib.as_array(values, (n,))
+            ports = known[references[0]]
+            return guarded(key, lambda instance: instance.set_input_derivatives(ports, rates))
+
+        self._functions = _Exchange(get), _Exchange(set_), _Step(do_step), _Rates(set_rates)
+        self.get, self.set, self.do_step, self.set_rates = (
             int(ctypes.cast(function, ctypes.c_void_p).value or 0) for function in self._functions
         )
 

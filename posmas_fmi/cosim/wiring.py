@@ -60,10 +60,22 @@ def column(number: int) -> int:
 
 @attrs.frozen(eq=False)
 class Extra:
-    """An input of an FMU beside u: ``bias + Σ weight · source``."""
+    """An input of an FMU beside u: ``bias + Σ weight · source``.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+    bias : float
+    is_rate : bool
+        Whether it is the derivative of an input: of readings, the rate of change counts.
+    has_rate : bool
+        Whether it goes on with such a derivative: readings are those where the step begins.
+    """
 
     terms: tuple[Term, ...]
     bias: float = 0.0
+    is_rate: bool = False
+    has_rate: bool = False
 
 
 @attrs.frozen(eq=False, slots=False)
@@ -146,13 +158,35 @@ class Wiring:
             made.append(sp.csr_array(entries, shape=(len(self.flat), columns)))
         return made[0], made[1]
 
-    def inputs(self, readings: Array, drive: Array) -> Array:
-        """Values of all extra inputs, from the readings of all instances and a row of the drive."""
+    @cached_property
+    def extrapolates(self) -> bool:
+        """Whether an input goes on as the readings do that it is made of."""
+        return any(e.is_rate and any(t.source >= 0 for t in e.terms) for e in self.flat)
+
+    def inputs(
+        self, readings: Array, drive: Array, begin: Array | None = None, rates: Array | None = None
+    ) -> Array:
+        """Values of all extra inputs, from the readings of all instances and a row of the drive.
+
+        Parameters
+        ----------
+        readings, drive : array
+        begin, rates : array, optional
+            Readings where the step begins, and how they change over it [1/s]; needed where
+            `extrapolates` is true.
+        """
         if not self.flat:
             return np.zeros(0)
         of_readings, of_drive = self._matrices
-        known = readings[: of_readings.shape[1]]
-        return np.asarray(self.bias + of_readings @ known + of_drive @ drive)
+        width = of_readings.shape[1]
+        found = of_readings @ readings[:width]
+        if begin is not None and rates is not None:
+            is_rate, has_rate = (
+                np.array([getattr(e, name) for e in self.flat]) for name in ("is_rate", "has_rate")
+            )
+            found = np.where(has_rate, of_readings @ begin[:width], found)
+            found = np.where(is_rate, of_readings @ rates[:width], found)
+        return np.asarray(self.bias + found + of_drive @ drive)
 
     @staticmethod
     def take(sources: Any, readings: Array, drive: Array) -> Array:

@@ -380,7 +380,7 @@ def _columns(signals: dict[str, Signal], tables: dict[str, SignalTable]) -> dict
     """Where each signal stands, side by side."""
     first, columns = 0, {}
     for name, signal in signals.items():
-        columns[name] = Columns(first, signal.values.shape[1], tables[name].unit)
+        columns[name] = Columns(first, signal.values.shape[1], tables[name].unit, signal.linear)
         first += signal.values.shape[1]
     return columns
 

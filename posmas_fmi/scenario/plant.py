@@ -147,7 +147,13 @@ def make_instances(
         Instance(table.name, abouts[path], table.parameters, nothing, nothing, table.tolerance)
         for table, path in zip(scenario.components, files[N:], strict=True)
     ]
-    wires = Wires(agents, components, scenario.signal_columns)
+    wires = Wires(
+        agents,
+        components,
+        scenario.signal_columns,
+        every.tolist(),
+        scenario.settings.input_derivatives,
+    )
     for k in range(N):
         wires.exogenous(k, plant.exogenous, "$.plant.exogenous")
     for k, table in enumerate(scenario.components):

@@ -51,12 +51,15 @@ class Edge:
     feedthrough : bool
         Whether the source follows inputs of its FMU at once, so that the value is a step older
         still than the delay says.
+    ramp : bool
+        Whether the input goes on linearly during the step, by its derivative, else it is held.
     """
 
     source: str
     target: str
     delay: int
     feedthrough: bool
+    ramp: bool = False
 
 
 @attrs.frozen
@@ -100,6 +103,7 @@ class Schedule:
             for edge in self.edges[:EDGES]:
                 late = f"{edge.delay} step{'s' if edge.delay != 1 else ''} late"
                 more = ", and its source follows inputs at once" if edge.feedthrough else ""
+                more += ", going on linearly during the step" if edge.ramp else ""
                 lines.append(f"  {edge.source} -> {edge.target}: {late}{more}")
             if len(self.edges) > EDGES:
                 lines.append(f"  and {len(self.edges) - EDGES} more (all with --json)")
@@ -184,21 +188,31 @@ def _owner(instances: Instances) -> tuple[Any, list[PlantSpec]]:
     return np.concatenate([[0], np.cumsum(widths)]), list(instances.specs)
 
 
-def _feeds(instances: Instances) -> list[tuple[int, str, int, str]]:
-    """Source instance (-1: a signal) and variable, target instance and variable, of each term."""
+@attrs.frozen
+class _Feed:
+    """One term of an input; the source -1 is a signal."""
+
+    source: int
+    variable: str
+    target: int
+    to: str
+    ramp: bool
+
+
+def _feeds(instances: Instances) -> list[_Feed]:
     at, specs = _owner(instances)
     found = []
-    for target, extras in enumerate(instances.wiring.extras):
+    for target, all_extras in enumerate(instances.wiring.extras):
         inputs = specs[target].inputs.variables
+        extras = [extra for extra in all_extras if not extra.is_rate]
         first = len(inputs) - len(extras)
         for k, extra in enumerate(extras):
             for term in extra.terms:
-                if term.source < 0:
-                    found.append((-1, f"signal {-1 - term.source}", target, inputs[first + k]))
-                    continue
-                source = int(np.searchsorted(at, term.source, side="right")) - 1
-                variable = specs[source].readings.variables[term.source - int(at[source])]
-                found.append((source, variable, target, inputs[first + k]))
+                source, variable = -1, f"signal {-1 - term.source}"
+                if term.source >= 0:
+                    source = int(np.searchsorted(at, term.source, side="right")) - 1
+                    variable = specs[source].readings.variables[term.source - int(at[source])]
+                found.append(_Feed(source, variable, target, inputs[first + k], extra.has_rate))
     return found
 
 
@@ -207,19 +221,20 @@ def _edges(
 ) -> list[Edge]:
     edges = []
     names = [spec.name for spec in instances.specs]
-    for source, variable, target, to in _feeds(instances):
-        end = f"{names[target]}.{to}"
-        if source < 0:
-            edges.append(Edge(variable, end, 0, False))
+    for feed in _feeds(instances):
+        end = f"{names[feed.target]}.{feed.to}"
+        if feed.source < 0:
+            edges.append(Edge(feed.variable, end, 0, False, feed.ramp))
             continue
-        earlier = late.get(names[source], 0) < late.get(names[target], 0)
+        earlier = late.get(names[feed.source], 0) < late.get(names[feed.target], 0)
         known_at_end = earlier or coupling == "iterate"
         edges.append(
             Edge(
-                f"{names[source]}.{variable}",
+                f"{names[feed.source]}.{feed.variable}",
                 end,
                 0 if known_at_end else 1,
-                feeds_through(abouts[source], variable),
+                feeds_through(abouts[feed.source], feed.variable),
+                feed.ramp,
             )
         )
     return edges
@@ -247,9 +262,9 @@ def _loops(instances: Instances) -> tuple[tuple[str, ...], ...]:
     import networkx
 
     graph = networkx.DiGraph()
-    for source, _, target, _ in _feeds(instances):
-        if source >= 0:
-            graph.add_edge(source, target)
+    for feed in _feeds(instances):
+        if feed.source >= 0:
+            graph.add_edge(feed.source, feed.target)
     names = [spec.name for spec in instances.specs]
     groups = [sorted(group) for group in networkx.strongly_connected_components(graph)]
     loops = [g for g in groups if len(g) > 1 or graph.has_edge(g[0], g[0])]

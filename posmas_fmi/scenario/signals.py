@@ -60,11 +60,14 @@ class Columns:
     first, count : int
         First column and number of columns.
     unit : str or None
+    linear : bool
+        Whether it goes on linearly between the times of its table.
     """
 
     first: int
     count: int
     unit: str | None = None
+    linear: bool = False
 
 
 @attrs.frozen(eq=False)
@@ -75,20 +78,31 @@ class Signals:
     ----------
     signals : tuple of Signal
     clock : Clock
+    rates : tuple of (int, int)
+        A column and a number of communication steps, for a further column each: its mean rate of
+        change over the steps that follow [1/s].
     """
 
     signals: tuple[Signal, ...]
     clock: Clock
+    rates: tuple[tuple[int, int], ...] = ()
 
     @property
     def columns(self) -> int:
-        """How many columns all signals have."""
-        return sum(signal.values.shape[1] for signal in self.signals)
+        """How many columns there are, those of rates last."""
+        return sum(int(s.values.shape[1]) for s in self.signals) + len(self.rates)
 
     def rows(self, begin: int, end: int) -> Array:
         """Values at the communication points begin … end - 1."""
-        times = np.array([self.clock.time(k) for k in range(begin, end)])
-        return np.concatenate([signal.at(times) for signal in self.signals], axis=1)
+        longest = max((steps for _, steps in self.rates), default=0)
+        times = np.array([self.clock.time(k) for k in range(begin, end + longest)])
+        values = np.concatenate([signal.at(times) for signal in self.signals], axis=1)
+        here = values[: end - begin]
+        rates = [
+            (values[steps : steps + len(here), [one]] - here[:, [one]]) / (steps * self.clock.h)
+            for one, steps in self.rates
+        ]
+        return np.concatenate([here, *rates], axis=1)
 
 
 def read_signal(

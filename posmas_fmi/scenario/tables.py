@@ -7,6 +7,7 @@ from typing import Any, Literal
 import attrs
 
 Matrix = list[list[float]]
+Derivatives = Literal["none", "signals", "all"]
 
 
 @attrs.frozen
@@ -62,6 +63,11 @@ class ScenarioTable:
         How FMUs that are connected step: all at once with readings of the last communication
         point; agents first, then each component with what those before it show by then; or all
         at once, again and again until inputs and readings fit (the FMUs must give their states).
+    input_derivatives : {"none", "signals", "all"}
+        Which inputs go on linearly during a communication step, of FMUs of FMI 2 that interpolate
+        (canInterpolateInputs), instead of being held: those that follow a signal with
+        ``interpolation = "linear"``; all: also those that are connected to other FMUs, as these
+        went on in the step before. What a controller sets is held in any case.
     snapshot : float
         Keep all state of the run every so many seconds, to go on from there (`--resume`,
         `--branch`); 0: never.
@@ -76,6 +82,7 @@ class ScenarioTable:
     threads: int = 1
     coupling: Literal["jacobi", "gauss-seidel", "iterate"] = "jacobi"
     snapshot: float = 0.0
+    input_derivatives: Derivatives = "signals"
 
 
 @attrs.frozen
@@ -296,7 +303,8 @@ class SignalTable:
     unit : str, optional
         In which the signal is; it is converted to that of the input that follows it.
     interpolation : {"hold", "linear"}
-        Between two times of the file. A signal is held over a communication step in any case.
+        Between two times of the file. A signal is held over a communication step, unless it is
+        linear and the FMU interpolates, see `input_derivatives` in ``[scenario]``.
     """
 
     value: float | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import attrs
@@ -15,7 +15,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.fmu.about import About, fitted
 from posmas_fmi.fmu.units import Conversion
 from posmas_fmi.scenario.signals import Columns, Signals
-from posmas_fmi.scenario.tables import ConnectionTable
+from posmas_fmi.scenario.tables import ConnectionTable, Derivatives
 
 AGENTS = "agents"
 
@@ -35,6 +35,8 @@ class Instance:
     tolerance : float or None
     extras : dict of str to Extra
         FMU inputs beside those of the protocol.
+    rates : dict of str to Extra
+        Derivatives of some of these.
     more : list of str
         FMU variables that are read besides.
     """
@@ -46,6 +48,7 @@ class Instance:
     readings: PortMap
     tolerance: float | None = None
     extras: dict[str, Extra] = attrs.field(factory=dict)
+    rates: dict[str, Extra] = attrs.field(factory=dict)
     more: list[str] = attrs.field(factory=list)
 
     def check(self, variable: str, place: str) -> None:
@@ -62,6 +65,12 @@ class Instance:
         if variable not in self.more:
             self.more.append(variable)
         return len(self.readings.variables) + self.more.index(variable)
+
+    def interpolates(self, variable: str) -> bool:
+        """Whether the FMU takes the derivative of an input (FMI 2, canInterpolateInputs)."""
+        about = self.about
+        able = about.kind == "Co-Simulation" and bool(about.interface.canInterpolateInputs)
+        return able and about.version == 2 and about.variable(variable).type == "Real"
 
     def feed(self, variable: str, extra: Extra, place: str) -> None:
         """Let an input be what it is wired to.
@@ -81,7 +90,10 @@ class Instance:
             self.about.path,
             self.values,
             self.name,
-            converted(self.about, self.inputs) + PortMap.plain(tuple(self.extras)),
+            attrs.evolve(
+                converted(self.about, self.inputs) + PortMap.plain(tuple(self.extras)),
+                rates=tuple(self.rates),
+            ),
             converted(self.about, self.readings) + PortMap.plain(tuple(self.more)),
             self.tolerance,
         )
@@ -147,6 +159,11 @@ class Wires:
     agents, components : list of Instance
     columns : mapping of str to Columns
         Where each signal stands.
+    every : sequence of int
+        Period of each instance in communication steps.
+    derivatives : {"none", "signals", "all"}
+        Of which inputs FMUs are told how they go on during a step, where they interpolate: those
+        that follow a signal that is linear, or those that are connected as well.
     """
 
     def __init__(
@@ -154,7 +171,13 @@ class Wires:
         agents: list[Instance],
         components: list[Instance],
         columns: Mapping[str, Columns],
+        every: Sequence[int] = (),
+        derivatives: Derivatives = "none",
     ) -> None:
+        self._every, self._derivatives = every, derivatives
+        self._rates: dict[tuple[int, int], int] = {}  # columns of rates, by column and steps
+        self._first_rate = sum(one.count for one in columns.values())
+        self._with_rate: dict[tuple[int, str], list[tuple[_Reading | int, float]]] = {}
         self._agents, self._all = agents, [*agents, *components]
         self._columns = columns
         self._number = {one.name: k for k, one in enumerate(self._all)}
@@ -188,6 +211,15 @@ class Wires:
             source = column(found.first + (instance if count > 1 else 0))
             unit = self._from_signal(found.unit, instance, variable, where)
             self._terms.append((instance, variable, [(source, unit.scale)], unit.offset, where))
+            goes_on = found.linear and self._derivatives != "none"
+            if goes_on and self._all[instance].interpolates(variable):
+                rate = self._rate_of(-1 - source, int(self._every[instance]))
+                self._with_rate[instance, variable] = [(rate, unit.scale)]
+
+    def _rate_of(self, signal: int, steps: int) -> int:
+        """Source that is the rate of change of a column over so many communication steps."""
+        number = self._rates.setdefault((signal, steps), len(self._rates))
+        return column(self._first_rate + number)
 
     def measure(self, sources: Mapping[str, str], place: str) -> None:
         """Let every agent measure more than y: signals, readings of its FMU or of a component's.
@@ -247,6 +279,10 @@ class Wires:
                     weight, bias = unit.scale, bias + unit.offset
                 terms.append((reading, weight))
             self._terms.append((target, variable, list(terms), bias, place))
+            steady = all(self._every[i] == 1 for i in (target, *(r.instance for r in chosen)))
+            wanted = self._derivatives == "all" and steady
+            if wanted and self._all[target].interpolates(variable):
+                self._with_rate[target, variable] = list(terms)
 
         if table.sum:
             if "{agent}" in to:
@@ -337,11 +373,17 @@ class Wires:
             return source if isinstance(source, int) else int(at[source.instance] + local[source])
 
         for instance, variable, terms, bias, where in self._terms:
-            extra = Extra(tuple(Term(place(s), w) for s, w in terms), bias)
+            rate = self._with_rate.get((instance, variable))
+            extra = Extra(tuple(Term(place(s), w) for s, w in terms), bias, has_rate=bool(rate))
             self._all[instance].feed(variable, extra, where)
+            if rate:
+                rates = tuple(Term(place(s), w) for s, w in rate)
+                self._all[instance].rates[variable] = Extra(rates, is_rate=True)
+        if signals is not None and self._rates:
+            signals = attrs.evolve(signals, rates=tuple(self._rates))
         measured = [[place(source) for source in ends] for ends in self._measured]
         wiring = Wiring(
-            tuple(tuple(one.extras.values()) for one in self._all),
+            tuple((*one.extras.values(), *one.rates.values()) for one in self._all),
             np.array(measured, dtype=np.int64).reshape(len(measured), n).T,
             tuple(place(reading) for reading in recorded),
             NoDrive() if signals is None else signals,

@@ -13,6 +13,7 @@ typedef int Set2(void *, const uint32_t[], size_t, const double[]);
 typedef int Step2(void *, double, double, int);
 typedef int BooleanStatus2(void *, int, int *);
 typedef int RealStatus2(void *, int, double *);
+typedef int SetRates2(void *, const uint32_t[], size_t, const int32_t[], const double[]);
 typedef int Get3(void *, const uint32_t[], size_t, double[], size_t);
 typedef int Set3(void *, const uint32_t[], size_t, const double[], size_t);
 typedef int Step3(void *, double, double, bool, bool *, bool *, bool *, double *);
@@ -110,6 +111,7 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
 {
     const Binding *b = &f->bindings[f->binding[instance]];
     void *component = f->component[instance];
+    const double *rates = inputs + b->inputs.n_ports;
     if (b->inputs.places || b->inputs.scale) {
         if (!convert(f, b, instance, inputs, scratch, report))
             return 0;
@@ -120,6 +122,14 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
     int status = set(b, component, &b->inputs, inputs);
     if (status != OK && !odd(status, CALL_SET, instance, before, report))
         return 0;
+    if (b->n_rates && b->set_rates) {
+        before = said(f);
+        begin(f, CALL_SET_RATES, instance);
+        status = ((SetRates2 *)b->set_rates)(component, b->rate_references, (size_t)b->n_rates,
+                                             b->rate_orders, rates);
+        if (status != OK && !odd(status, CALL_SET_RATES, instance, before, report))
+            return 0;
+    }
     before = said(f);
     begin(f, CALL_STEP, instance);
     if (b->fmi == 2) {

@@ -30,6 +30,10 @@ typedef struct {
     void (*real_status)(void);
     Ports inputs;
     Ports readings; /* outputs y, then states x where they are shown */
+    void (*set_rates)(void);         /* FMI 2: input derivatives, of order 1; NULL: none */
+    const uint32_t *rate_references; /* of the inputs that go on with a slope */
+    const int32_t *rate_orders;
+    int64_t n_rates;                 /* they follow the inputs of the ports */
 } Binding;
 
 typedef enum {
@@ -43,7 +47,8 @@ typedef enum {
     CALL_NOT_FINITE,      /* a value that was read */
     CALL_WORKER_DIED,     /* the process that runs the FMU */
     CALL_DEADLINE,        /* it did not answer in time */
-    CALL_INTERRUPTED      /* the user wants an end; it is not waited for any more */
+    CALL_INTERRUPTED,     /* the user wants an end; it is not waited for any more */
+    CALL_SET_RATES
 } Call;
 
 /* Which call was not right. */
@@ -93,6 +98,12 @@ typedef struct {
     const int64_t *is_remote;   /* of each instance */
     Calling *calling;           /* is told before each call; NULL: nobody watches */
 } Fmus;
+
+/* Number of inputs of an instance: those of its ports and the slopes after them. */
+static inline int64_t fmus_inputs(const Binding *b)
+{
+    return b->inputs.n_ports + b->n_rates;
+}
 
 static inline int fmus_is_remote(const Fmus *f, int64_t instance)
 {

@@ -53,7 +53,7 @@ static void do_order(const WorkerLoop *w, int64_t i, int64_t order)
 {
     Slot *s = w->slots[i];
     const Binding *b = &w->fmus->bindings[w->fmus->binding[i]];
-    double *inputs = inputs_of(s), *readings = inputs + b->inputs.n_ports;
+    double *inputs = inputs_of(s), *readings = inputs + fmus_inputs(b);
     Report report = {{0}, {0}, 0};
     if (!s->steps || fmus_step(w->fmus, i, s->t, s->h, inputs, w->scratch, &report))
         fmus_read(w->fmus, i, readings, w->scratch, &report);
@@ -102,7 +102,7 @@ EXPORT void worker_run(WorkerLoop *w)
  * order; return how many steps went well. */
 EXPORT int64_t worker_replay(const WorkerLoop *w, int64_t i, const double *rows, int64_t n)
 {
-    const int64_t inputs = w->fmus->bindings[w->fmus->binding[i]].inputs.n_ports;
+    const int64_t inputs = fmus_inputs(&w->fmus->bindings[w->fmus->binding[i]]);
     Slot *s = w->slots[i];
     Report report = {{0}, {0}, 0};
     int64_t k = 0;

@@ -92,7 +92,7 @@ class Remote:
         for k in range(n):
             entry = self._entries[k]
             entry.worker = shared.index(self._remote[k].worker) if k in self._remote else -1
-            entry.inputs = len(inputs[k].variables)
+            entry.inputs = inputs[k].width
             entry.readings = len(readings[k].variables)
             entry.past.wanted = keeps and k in self._remote
             entry.past.most = PAST // (8 * (2 + entry.inputs))

@@ -180,9 +180,7 @@ class Server:
         readings = [port_map(entry["readings"]) for entry in entries]
         fmus = Fmus(instances, inputs, readings, self._messages)
         fmus.structure.calling = ctypes.addressof(self._head.calling)
-        widths = [
-            (len(i.variables), len(r.variables)) for i, r in zip(inputs, readings, strict=True)
-        ]
+        widths = [(i.width, len(r.variables)) for i, r in zip(inputs, readings, strict=True)]
         memory = layout.SlotMemory.of(handle, widths)
         os.close(handle)
         slots = np.array(memory.addresses, dtype=np.uintp)
@@ -216,6 +214,7 @@ def port_map(facts: dict[str, Any]) -> PortMap:
         tuple(facts["offset"]),
         tuple(facts["units"]),
         facts["place"],
+        tuple(facts["rates"]),
     )
 
 
