@@ -84,6 +84,28 @@ def test_a_branch_has_the_same_past_and_another_future(tmp_path: Path) -> None:
     assert np.abs(second["s"].values[-1] - first["s"].values[-1]).max() > 0.5
 
 
+def test_a_run_that_is_cut_off_at_its_start_has_nothing_of_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from posmas_fmi.scenario import job
+
+    run(made(tmp_path), tmp_path / "out", interrupted(150), report=False)
+
+    def cut_off(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job, "_simulate", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            run(made(tmp_path, ""), tmp_path / "out", report=False)
+    assert {path.name for path in (tmp_path / "out").rglob("*.*")} == {
+        "design.json",
+        "manifest.json",
+    }
+    again = run(made(tmp_path, ""), tmp_path / "out", report=False, resume=True)
+    assert again.summary["messages_lost"] == 0
+
+
 def test_what_cannot_go_on(tmp_path: Path) -> None:
     definition = made(tmp_path)
     out = tmp_path / "out"

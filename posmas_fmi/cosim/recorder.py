@@ -1,12 +1,14 @@
-"""Results as NetCDF-4, written in chunks while the run goes on."""
+"""Results as NetCDF-4, written while the run goes on."""
 
 from __future__ import annotations
 
 import errno
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
+from time import monotonic
 from types import TracebackType
 from typing import Any
 
@@ -16,9 +18,12 @@ import numpy as np
 from posmas_fmi.errors import InputError, ResultsError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
+from posmas_fmi.writing import whole
 
 CHUNK = 512  # rows held in memory before they are written,
-HELD = 16_000_000  # or fewer: bytes
+HELD = 16_000_000  # or fewer: bytes,
+LATEST = 0.5  # or, at the next row, after so many seconds
+FIRST = 64_000_000  # bytes that a file begins with at most
 SPARE = 250_000  # bytes that the file itself may need, beside the rows
 
 
@@ -61,7 +66,11 @@ class Layout:
 
 
 class Recorder:
-    """Write rows of named arrays to one NetCDF-4 file.
+    """Write rows of named arrays to one NetCDF-4 file, which is whole at every moment.
+
+    The structure of the file is complete before it gets its name; a run then only fills in numbers
+    that were missing (NaN). So whatever ends the process, the file can be read. Where it turns
+    out too small or too large, a new file takes its place at once.
 
     Parameters
     ----------
@@ -76,11 +85,15 @@ class Recorder:
         Global attributes of the file. ``complete`` is 0 until `finish`.
     keep : int, optional
         Go on with the file that is there, after so many of its rows.
+    expected : int
+        Number of rows that there will be, if all goes well; more or fewer may come.
 
     Raises
     ------
     InputError
         If the file to go on with cannot be read, has other variables or fewer rows.
+    ResultsError
+        If there is no room for the file.
     """
 
     def __init__(
@@ -91,59 +104,120 @@ class Recorder:
         variables: tuple[str, ...],
         attributes: dict[str, Any],
         keep: int | None = None,
+        expected: int = 0,
     ) -> None:
-        import h5netcdf
-        import h5py
-
-        self._layout = layout
+        self._path, self._layout, self._network = path, layout, network
+        self._variables, self._attributes = variables, attributes
         self._blocks: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
         self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
         self._written = dict(self._taken)
         self._held = 0  # bytes
-        self._path, self._full = path, False
+        self._flushed = monotonic()
+        self._full = False
+        self._handle = -1
+        self._offsets: dict[str, int] = {}
+        self._rows = 0  # of the file
+        self._expected = expected
         if keep is not None:
-            self._go_on(path, keep)
-            return
-        # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
-        self._disk = h5py.File(path, "w", track_order=True)
-        self._reserve(SPARE)
-        self._file = h5netcdf.File(self._disk, "a")
-        self._define(network, variables, attributes)
-        # rows go past h5netcdf, which takes milliseconds for each write
-        self._data = {name: self._disk[name] for name in self._blocks}
+            _check(path, tuple(self._blocks), keep)
+            for name in self._blocks:
+                if name != "x_baseline":  # that run is made anew
+                    self._taken[name] = self._written[name] = keep
+        first = max(CHUNK, FIRST // self._row_size)
+        self._replace(max(min(first, expected) if expected else CHUNK, self.rows))
 
-    def _go_on(self, path: Path, keep: int) -> None:
+    @property
+    def _row_size(self) -> int:
+        """Bytes of one row of all variables."""
+        sizes = (self._layout.shape(name)[1] for name in self._variables)
+        return 8 + sum(8 * int(np.prod(size)) for size in sizes)
+
+    # ---- the file -------------------------------------------------------------------------------
+
+    def _replace(self, rows: int, complete: bool = False) -> None:
+        """Put a file with room for so many rows in the place of the one there is."""
+        partial = self._path.with_name(f"{self._path.name}.partial")
+        try:
+            offsets = self._make(partial, rows, complete)
+            if any(self._written.values()):
+                handle = os.open(partial, _FLAGS)
+                try:
+                    self._copy(handle, offsets)
+                finally:
+                    os.close(handle)
+            self._let_go()  # not every system replaces a file that is open
+            os.replace(partial, self._path)
+            self._handle = os.open(self._path, _FLAGS)
+        except OSError as error:
+            raise self._no_room(error) from None
+        finally:
+            partial.unlink(missing_ok=True)
+        self._offsets, self._rows = offsets, rows
+
+    def _let_go(self) -> None:
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+    def _make(self, path: Path, rows: int, complete: bool) -> dict[str, int]:
+        """Write a file without results; return where those of each variable begin in it."""
         import h5netcdf
         import h5py
 
-        try:
-            self._disk = h5py.File(path, "r+", track_order=True)
-        except OSError as error:
-            raise InputError(f"cannot go on with these results: {error}", str(path)) from None
-        missing = [name for name in self._blocks if name not in self._disk]
-        if missing or len(self._disk["time"]) < keep:
-            found = f"no {missing[0]}" if missing else f"{len(self._disk['time'])} rows"
-            self._disk.close()
-            raise InputError(
-                f"cannot go on with these results: expected {keep} rows of "
-                f"{', '.join(self._blocks)} (there is {found})",
-                str(path),
-            )
-        self._file = h5netcdf.File(self._disk, "a")
-        self._file.attrs["complete"] = 0
-        self._data = {name: self._disk[name] for name in self._blocks}
-        for name, data in self._data.items():
-            if len(data) > keep:
-                data.resize(keep, axis=0)
-            if name != "x_baseline":  # that run is made anew
-                self._taken[name] = self._written[name] = keep
+        path.unlink(missing_ok=True)
+        # opened below h5netcdf, whose own flush leaves everything in memory; NetCDF wants the order
+        with h5py.File(path, "w", track_order=True) as disk:
+            self._reserve(disk, rows * self._row_size)
+            with h5netcdf.File(disk, "a") as file:
+                self._define(file, rows, complete)
+            data = {name: disk[name] for name in self._blocks}
+            for one in data.values() if rows else ():
+                one[:1] = np.nan  # makes HDF5 fill all of it
+            disk.flush()
+            if hasattr(os, "posix_fallocate"):  # give back what was not needed
+                os.ftruncate(disk.id.get_vfd_handle(), disk.id.get_filesize())
+            return {name: one.id.get_offset() or 0 for name, one in data.items()}
 
-    def _define(
-        self, network: Network, variables: tuple[str, ...], attributes: dict[str, Any]
-    ) -> None:
-        file, layout = self._file, self._layout
+    def _reserve(self, disk: Any, size: int) -> None:
+        """Have the system set room aside: HDF5 does not end well when it finds none."""
+        if not hasattr(os, "posix_fallocate"):
+            return
+        size += SPARE + 500 * len(self._layout.agents) + 24 * self._network.adjacency.nnz
+        try:
+            os.posix_fallocate(disk.id.get_vfd_handle(), disk.id.get_filesize(), size)
+        except OSError as error:
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # not on this file system
+                raise
+
+    def _no_room(self, error: OSError) -> ResultsError:
+        self._full = True
+        why = error.strerror or error
+        if self._rows:
+            what = f"no room for more results ({why}); what was written stays readable, and the "
+            return ResultsError(f"{what}run goes on with --resume when there is", str(self._path))
+        size = max(self._expected, CHUNK) * self._row_size / 1e6
+        return ResultsError(
+            f"no room for the results ({why}), which will take {size:.3g} MB; choose another "
+            "folder, or record less: [record] has every and variables",
+            str(self._path),
+        )
+
+    def _copy(self, handle: int, offsets: dict[str, int]) -> None:
+        """Take the rows over from the file there is."""
+        import h5py
+
+        with h5py.File(self._path, "r") as old:
+            for name, count in self._written.items():
+                size = 8 * int(np.prod(old[name].shape[1:]))
+                step = max(1, HELD // size)
+                for begin in range(0, count, step):
+                    rows = old[name][begin : min(begin + step, count)]
+                    _write(handle, rows, offsets[name] + begin * size)
+
+    def _define(self, file: Any, rows: int, complete: bool) -> None:
+        layout, network = self._layout, self._network
         file.dimensions = {
-            "time": None,
+            "time": rows or None,
             "agent": len(layout.agents),
             "state": len(layout.states),
             "input": len(layout.inputs),
@@ -161,16 +235,14 @@ class Recorder:
         ):
             file.create_variable(name, ("arc",), data.dtype, data=data)
         file.create_variable("pinning", ("agent",), float, data=network.pinning)
-        time = file.create_variable("time", ("time",), float, chunks=(CHUNK,))
+        time = file.create_variable("time", ("time",), float, fillvalue=np.nan)
         time.attrs["units"] = "s"
-        for name in variables:
-            dimensions, sizes = layout.shape(name)
-            file.create_variable(
-                name, ("time", *dimensions), float, chunks=_chunks(sizes), fillvalue=np.nan
-            )
-        file.attrs.update({**attributes, "complete": 0})
-        self._disk.flush()
-        self._release()
+        for name in self._variables:
+            dimensions, _ = layout.shape(name)
+            file.create_variable(name, ("time", *dimensions), float, fillvalue=np.nan)
+        file.attrs.update({**self._attributes, "complete": int(complete)})
+
+    # ---- rows -----------------------------------------------------------------------------------
 
     def record(self, time: float, values: dict[str, Array]) -> None:
         """Add one row; the arrays are copied. A variable that is left out stays NaN there."""
@@ -189,78 +261,76 @@ class Recorder:
             self._taken[name] += len(block)
             self._held += block.nbytes
         rows = max(self._taken[name] - self._written[name] for name in values)
-        if rows >= CHUNK or self._held >= HELD:
+        if rows >= CHUNK or self._held >= HELD or monotonic() - self._flushed > LATEST:
             self.flush()
 
     def flush(self) -> None:
-        """Write what is held in memory.
+        """Write what is held in memory, times last: a row with a time is there.
 
         Raises
         ------
         ResultsError
             If there is no room for it; what was written before stays.
         """
+        self._flushed = monotonic()
         if self._full or not any(self._blocks.values()):
             return
-        self._reserve(SPARE + sum(map(self._growth, self._data)))
-        for name, data in self._data.items():
-            if len(data) < self._taken["time"]:
-                data.resize(self._taken["time"], axis=0)
-            blocks = self._blocks[name]
-            if blocks:
-                rows = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
-                data[self._written[name] : self._taken[name]] = rows
-                blocks.clear()
-        self._written = dict(self._taken)
+        if self.rows > self._rows:
+            self._grow()
+        for name in (*self._variables, "time"):
+            blocks, begin = self._blocks[name], self._written[name]
+            if not blocks:
+                continue
+            rows = np.concatenate(blocks, dtype=float)
+            size = rows.nbytes // max(1, len(rows))
+            try:
+                _write(self._handle, rows, self._offsets[name] + begin * size)
+            except OSError as error:
+                raise self._no_room(error) from None
+            blocks.clear()
+            self._written[name] = self._taken[name]
         self._held = 0
-        self._disk.flush()
-        self._release()
 
-    def _growth(self, name: str) -> int:
-        """Bytes that the file grows by at most, for one variable."""
-        data = self._data[name]
-        rows = data.chunks[0]
-        chunks = -(-self._taken["time"] // rows) - self._written[name] // rows
-        return int(chunks * rows * np.prod(data.shape[1:], dtype=int) * data.dtype.itemsize)
-
-    def _reserve(self, size: int) -> None:
-        """Have the system set room aside: when HDF5 finds none, the file is lost."""
-        if not hasattr(os, "posix_fallocate"):
-            return
+    def _grow(self) -> None:
+        """Make room for what is held: for much more, or, where the disk is short, just for that."""
+        more = max(self.rows, 4 * self._rows)
         try:
-            os.posix_fallocate(self._disk.id.get_vfd_handle(), self._disk.id.get_filesize(), size)
-        except OSError as error:
-            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # not on this file system
-                return
-            self._full = True
-            raise ResultsError(
-                f"no room for more results: {error.strerror}; what was written stays readable",
-                str(self._path),
-            ) from None
-
-    def _release(self) -> None:
-        """Give back what was set aside and not needed."""
-        if hasattr(os, "posix_fallocate"):
-            os.ftruncate(self._disk.id.get_vfd_handle(), self._disk.id.get_filesize())
+            self._replace(max(self.rows, min(more, self._expected)) if self._expected else more)
+        except ResultsError:
+            self._full = False
+            self._replace(self.rows)
 
     @property
     def rows(self) -> int:
         """Number of communication points recorded."""
         return self._taken["time"]
 
+    # ---- the end --------------------------------------------------------------------------------
+
     def finish(self) -> None:
         """Write the rest and mark the result as complete."""
         self.flush()
-        if not self._full:
-            self._file.attrs["complete"] = 1
+        if self._full:
+            return
+        if self._rows != self.rows:
+            self._replace(self.rows, complete=True)
+            return
+        import h5py
+
+        with h5py.File(self._path, "r+", track_order=True) as file:
+            file.attrs.modify("complete", 1)
 
     def close(self) -> None:
-        """Write the rest and close the file; `complete` stays as it is."""
+        """Write the rest, leave out room that was not needed; `complete` stays as it is."""
+        if self._handle < 0:
+            return
         try:
             self.flush()
+            if self._rows != self.rows:
+                with suppress(ResultsError):  # then it stays: its times are missing
+                    self._replace(self.rows)
         finally:
-            self._file.close()
-            self._disk.close()
+            self._let_go()
 
     def __enter__(self) -> Recorder:
         return self
@@ -272,6 +342,48 @@ class Recorder:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def written_rows(time: Array) -> int:
+    """Return how many rows of a result are there: those from its start that have a time.
+
+    Examples
+    --------
+    >>> written_rows(np.array([0.0, 0.1, np.nan]))
+    2
+    """
+    missing = np.flatnonzero(np.isnan(time))
+    return int(missing[0]) if missing.size else len(time)
+
+
+def _check(path: Path, names: tuple[str, ...], keep: int) -> None:
+    """See that one can go on after so many rows of a file."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            missing = [name for name in names if name not in file]
+            rows = 0 if "time" in missing else written_rows(file["time"][...])
+    except OSError as error:
+        raise InputError(f"cannot go on with these results: {error}", str(path)) from None
+    if missing or rows < keep:
+        found = f"no {missing[0]}" if missing else f"{rows} rows"
+        raise InputError(
+            f"cannot go on with these results: expected {keep} rows of {', '.join(names)} "
+            f"(there is {found})",
+            str(path),
+        )
+
+
+def _write(handle: int, rows: Array, at: int) -> None:
+    """Write all of an array at a place in a file."""
+    left = memoryview(np.ascontiguousarray(rows).data).cast("B")
+    os.lseek(handle, at, os.SEEK_SET)
+    while left:
+        left = left[os.write(handle, left) :]
+
+
+_FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 class Thinned:
@@ -338,7 +450,7 @@ def write_csv(results: Path, path: Path) -> None:
 
     import h5netcdf
 
-    with h5netcdf.File(results, "r") as file, path.open("w", newline="", encoding="utf-8") as text:
+    with h5netcdf.File(results, "r") as file, whole(path) as text:
         labels = {
             name: [label.decode() if isinstance(label, bytes) else label for label in variable[...]]
             for name, variable in file.variables.items()
@@ -352,7 +464,7 @@ def write_csv(results: Path, path: Path) -> None:
             for name in names
             for coordinates in product(*(labels[d] for d in signals[name].dimensions[1:]))
         )
-        rows = len(file.dimensions["time"])
+        rows = written_rows(file["time"][...])
         width = sum(int(np.prod(signals[name].shape[1:])) for name in names)
         block = max(1, HELD // (64 * width))  # numbers take more room as text
         for begin in range(0, rows, block):
@@ -366,9 +478,3 @@ def _text() -> Any:
     import h5py
 
     return h5py.string_dtype("utf-8")
-
-
-def _chunks(sizes: tuple[int, ...]) -> tuple[int, ...]:
-    """About one megabyte per chunk, at least one row, at most `CHUNK` rows."""
-    row = 8 * int(np.prod(sizes))
-    return (max(1, min(CHUNK, 1_000_000 // max(1, row))), *sizes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.writing import whole
 
 
 @attrs.frozen(eq=False)
@@ -45,16 +45,19 @@ class Snapshot:
         ----------
         path : Path
             Ending in ``.npz``.
+
+        Raises
+        ------
+        ResultsError
+            If it cannot be written, on a full disk say.
         """
         facts = {"k": self.k, "counts": self.counts, "serialised": self.fmus is not None}
         content: dict[str, Any] = {f"array_{name}": value for name, value in self.arrays.items()}
         for number, data in enumerate(self.fmus or ()):
             content[f"fmu_{number}"] = np.frombuffer(data, dtype=np.uint8)
         content["facts"] = np.frombuffer(json.dumps(facts).encode(), dtype=np.uint8)
-        partial = path.with_suffix(".partial.npz")
-        with partial.open("wb") as file:
+        with whole(path, "wb") as file:
             np.savez(file, **content)
-        os.replace(partial, path)
 
     @classmethod
     def load(cls, path: Path) -> Snapshot:

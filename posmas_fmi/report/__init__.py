@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from posmas_fmi.errors import InputError
+from posmas_fmi.writing import whole
 
 __all__ = ["write_report"]
 
@@ -32,6 +32,8 @@ def write_report(folder: Path) -> Path:
     ------
     InputError
         If a file is missing or cannot be used; names the file and what to do.
+    ResultsError
+        If the report cannot be written.
 
     Examples
     --------
@@ -62,10 +64,6 @@ def _kpi_page(folder: Path) -> str:
 
 
 def _write(path: Path, page: str) -> Path:
-    try:
-        path.write_text(page, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise InputError(
-            f"cannot write the report ({error.strerror}); make the folder writable", str(path)
-        ) from error
+    with whole(path) as file:
+        file.write(page)
     return path

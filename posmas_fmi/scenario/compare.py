@@ -17,10 +17,10 @@ from posmas_fmi.cosim.master import Progress
 from posmas_fmi.design import Design
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.scenario.build import Scenario
+from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.job import (
     RunResult,
     make_design_of,
-    make_folder,
     make_law,
     run_designed,
     write_json,
@@ -113,20 +113,22 @@ def run_comparison(
             make_law(one, designed)
         except InputError as error:
             raise InputError(error.message, error.where.replace("$.control", place, 1)) from None
-    make_folder(folder)
-    for name in ("summary.json", "report.html", "results.nc"):
-        (folder / name).unlink(missing_ok=True)
-    steps = scenario.clock.steps
-    summaries = _all(runs, designed, folder, command, report, steps, progress("compare"), compare)
-    summary = together(summaries, compare)
-    summary["wall_s"] = round(time.perf_counter() - began, 3)
-    write_json(folder / "summary.json", summary)
-    first = folder / next(iter(runs))
-    manifest = json.loads((first / "manifest.json").read_text(encoding="utf-8"))
-    write_json(folder / "manifest.json", manifest | {"controllers": list(runs)})
-    if report and summary.get("kpi"):
-        write_report(folder)
-    return RunResult(folder, designed, summary)
+    with occupied(folder):
+        for name in ("summary.json", "report.html", "results.nc"):
+            (folder / name).unlink(missing_ok=True)
+        steps = scenario.clock.steps
+        summaries = _all(
+            runs, designed, folder, command, report, steps, progress("compare"), compare
+        )
+        summary = together(summaries, compare)
+        summary["wall_s"] = round(time.perf_counter() - began, 3)
+        write_json(folder / "summary.json", summary)
+        first = folder / next(iter(runs))
+        manifest = json.loads((first / "manifest.json").read_text(encoding="utf-8"))
+        write_json(folder / "manifest.json", manifest | {"controllers": list(runs)})
+        if report and summary.get("kpi"):
+            write_report(folder)
+        return RunResult(folder, designed, summary)
 
 
 def _all(

@@ -32,10 +32,12 @@ from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
+from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
-from posmas_fmi.scenario.resume import Beginning, branched, resumed, snapshots
+from posmas_fmi.scenario.resume import Beginning, branched, forget_snapshots, resumed, snapshots
 from posmas_fmi.scenario.schedule import make_schedule
 from posmas_fmi.scenario.verdict import summarise
+from posmas_fmi.writing import whole
 
 log = logging.getLogger(__name__)
 
@@ -168,8 +170,6 @@ def run_designed(
     branch: tuple[Path, float] | None = None,
 ) -> RunResult:
     """Run a scenario with a design that is there already; see `run`."""
-    from posmas_fmi.report import write_report
-
     designed = attrs.evolve(designed, network=law_network(scenario, designed))
     files = fmu_files(scenario)
     instances = make_instances(scenario, files, extras(scenario))
@@ -178,9 +178,29 @@ def run_designed(
         make_schedule(scenario, instances, [abouts[path] for path in files])
     system = make_system(scenario, designed, instances)
     choice = engine.choose(system.law, scenario.settings.engine, engine.unfit(system))
-    make_folder(folder)
-    sweep()
     told = manifest(scenario, files, choice, command)
+    with occupied(folder):
+        return _run_in(
+            folder, scenario, designed, instances, choice, told, progress, report, resume, branch
+        )
+
+
+def _run_in(
+    folder: Path,
+    scenario: Scenario,
+    designed: Design,
+    instances: Instances,
+    choice: engine.Choice,
+    told: dict[str, Any],
+    progress: Callable[[str], Progress | None],
+    report: bool,
+    resume: bool,
+    branch: tuple[Path, float] | None,
+) -> RunResult:
+    """Simulate, judge and report in a folder that is held for it; `told` is the manifest."""
+    from posmas_fmi.report import write_report
+
+    sweep()
     beginning = Beginning()
     if resume:
         beginning = resumed(scenario, folder, told)
@@ -190,6 +210,9 @@ def run_designed(
         scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
     for name in ("summary.json", "report.html", "results.csv"):
         (folder / name).unlink(missing_ok=True)
+    if not resume:  # a run that is cut off from here on does not go on with what another one left
+        (folder / "results.nc").unlink(missing_ok=True)
+        forget_snapshots(folder)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     if scenario.cooling is not None:
         from posmas_fmi.scenario.cooling import proved
@@ -246,9 +269,7 @@ def _simulate(
     variables = (*recorded, "x_baseline") if with_baseline else recorded
     with (
         instances.start() as plant,
-        _recorder(
-            scenario, designed.network, instances, folder, variables, beginning.keep
-        ) as recorder,
+        _recorder(scenario, designed.network, instances, folder, variables, beginning) as recorder,
     ):
         started(plant)
         system = make_system(scenario, designed, instances)
@@ -442,9 +463,12 @@ def _recorder(
     instances: Instances,
     folder: Path,
     variables: tuple[str, ...],
-    keep: int | None = None,
+    beginning: Beginning,
 ) -> Recorder:
     agent, recorded = scenario.agent, instances.recorded
+    steps, every = scenario.clock.steps, scenario.record.every
+    before = -(-beginning.k // every) if beginning.keep is None else 0  # those of another run
+    expected = steps // every + 1 + (steps % every > 0) - before
     layout = Layout(
         agents=network.names,
         states=tuple(f"x{k + 1}" for k in range(agent.m)),
@@ -459,7 +483,8 @@ def _recorder(
         "created_by": f"posmas-fmi {metadata.version('posmas-fmi')}",
     }
     names = (*variables, *layout.of_agents, *layout.of_run)
-    return Recorder(folder / "results.nc", layout, network, names, attributes, keep)
+    path, keep = folder / "results.nc", beginning.keep
+    return Recorder(path, layout, network, names, attributes, keep, max(1, expected))
 
 
 def manifest(
@@ -486,23 +511,7 @@ def _hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def make_folder(folder: Path) -> None:
-    """Make the folder of a run.
-
-    Raises
-    ------
-    InputError
-        If that is not possible.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot make the output folder: {error.strerror}; choose another with --out",
-            str(folder),
-        ) from None
-
-
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file; NaN is refused."""
-    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    with whole(path) as file:
+        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -9,6 +9,7 @@ from typing import Any
 import attrs
 
 from posmas_fmi.cosim.engine import Snapshots
+from posmas_fmi.cosim.recorder import written_rows
 from posmas_fmi.cosim.snapshot import Snapshot, newest
 from posmas_fmi.errors import InputError
 from posmas_fmi.scenario.build import Scenario
@@ -119,10 +120,7 @@ def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapsho
     """Return where the run begins, and keep snapshots in its folder as the scenario wants."""
     place = folder / FOLDER
     every = round(scenario.settings.snapshot / scenario.clock.h)
-    if place.is_dir():  # those of a run that is replaced, and those of what is done again
-        for path in place.glob("*.npz"):
-            if not path.stem.isdigit() or int(path.stem) > beginning.k or beginning.keep is None:
-                path.unlink()
+    forget_snapshots(folder, beginning.k if beginning.keep is not None else -1)
     if every:
         place.mkdir(exist_ok=True)
 
@@ -130,6 +128,13 @@ def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapsho
         snapshot.save(place / f"{snapshot.k}.npz")
 
     return Snapshots(beginning.snapshot, every, keep)
+
+
+def forget_snapshots(folder: Path, after: int = -1) -> None:
+    """Remove those after a communication point, or all of them."""
+    for path in (folder / FOLDER).glob("*.npz*"):
+        if not path.stem.isdigit() or int(path.stem) > after:
+            path.unlink()
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
@@ -147,6 +152,6 @@ def _rows(path: Path) -> tuple[int, bool]:
 
     try:
         with h5py.File(path, "r") as file:
-            return len(file["time"]), bool(file.attrs["complete"])
+            return written_rows(file["time"][...]), bool(file.attrs["complete"])
     except (OSError, KeyError):
         return 0, False
