@@ -165,7 +165,7 @@ def call_name(call: int, fmi: int) -> str:
     """Return the name of the FMI function of a call; empty for none."""
     name = _CALLS[call] if 0 <= call < len(_CALLS) else ""
     if name in ("Get", "Set"):
-        name += "Real" if fmi == 2 else "Float64"
+        name += "Real" if fmi < 3 else "Float64"
     return name and f"fmi{fmi}{name}"
 
 
@@ -504,7 +504,7 @@ class Fmus:
         instance.time = time
         function = _CALLS[incident.call]
         if function in ("Get", "Set"):
-            function += "Real" if instance.file.version == 2 else "Float64"
+            function += "Real" if instance.file.version < 3 else "Float64"
         messages: Sequence[str] = instance.messages
         if self.is_remote(incident.instance):
             return instance, function, messages

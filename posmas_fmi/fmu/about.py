@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import attrs
 import numpy as np
@@ -16,6 +17,7 @@ from posmas_fmi.fmu.clocks import Clock, read_clocks
 from posmas_fmi.fmu.units import Conversion, Units
 from posmas_fmi.fmu.variables import Ports, Variable, Variables
 
+_NEGATED, _BOOLEANS = "negatedAlias", ("true", "false", "1", "0")
 Kind = Literal["Co-Simulation", "Model Exchange"]
 
 
@@ -26,7 +28,7 @@ class About:
     Attributes
     ----------
     path : Path
-    version : {2, 3}
+    version : {1, 2, 3}
         FMI version.
     description : fmpy ModelDescription
         All of it.
@@ -38,7 +40,7 @@ class About:
     """
 
     path: Path
-    version: Literal[2, 3]
+    version: Literal[1, 2, 3]
     description: Any
     kind: Kind
     names: Variables
@@ -51,18 +53,18 @@ class About:
         Raises
         ------
         FmuError
-            If it is not of FMI 2.0 or 3, or a variable cannot be read.
+            If it is not of FMI 1.0, 2.0 or 3, or a variable cannot be read.
         """
         where, told = str(path), description.fmiVersion
-        if told != "2.0" and not told.startswith("3."):
-            raise FmuError(f"expected FMI 2.0 or 3.0 (got {told})", where)
+        if told not in ("1.0", "2.0") and not told.startswith("3."):
+            raise FmuError(f"expected FMI 1.0, 2.0 or 3.0 (got {told})", where)
         if kind is None:
             kind = "Co-Simulation" if description.coSimulation else "Model Exchange"
         try:
             variables = {v.name: v for v in map(Variable.read, description.modelVariables)}
         except (ValueError, TypeError) as error:
             raise ArchiveError(f"cannot read the variables: {error}", where) from error
-        version: Literal[2, 3] = 2 if told == "2.0" else 3
+        version: Literal[1, 2, 3] = 1 if told == "1.0" else 2 if told == "2.0" else 3
         return cls(path, version, description, kind, Variables(variables, where))
 
     def structured(self, values: Mapping[str, Any]) -> About:
@@ -153,7 +155,7 @@ def read_about(path: Path) -> About:
     ArchiveError
         If the archive is unsafe, or its description cannot be read.
     FmuError
-        If it is not of FMI 2.0 or 3.
+        If it is not of FMI 1.0, 2.0 or 3.
     """
     for finding in examine(path):
         if finding.severity == "fatal":
@@ -172,9 +174,29 @@ def read_description(place: Path, path: Path) -> Any:
     import fmpy
 
     try:
-        return fmpy.read_model_description(str(place), validate=False)
+        found = fmpy.read_model_description(str(place), validate=False)
+        return complete_fmi1(found, place) if found.fmiVersion == "1.0" else found
     except Exception as error:  # FMPy and lxml raise many kinds
         raise ArchiveError(f"cannot read modelDescription.xml: {error}", str(path)) from error
+
+
+def complete_fmi1(description: Any, place: Path) -> Any:
+    """Add what FMPy does not take over from FMI 1.0: capabilities; and leave negated aliases out.
+
+    Their values are those of other variables with the other sign, which would be read wrongly.
+    """
+    data = (place / DESCRIPTION).read_bytes() if place.is_dir() else read_entry(place, DESCRIPTION)
+    root = ElementTree.fromstring(data)
+    capabilities = root.find("Implementation/*/Capabilities")
+    if capabilities is not None:
+        for name, value in capabilities.attrib.items():
+            if hasattr(description.coSimulation, name) and value in _BOOLEANS:
+                setattr(description.coSimulation, name, value in ("true", "1"))
+    if root.find("Implementation/CoSimulation_Tool") is not None:
+        description.coSimulation.needsExecutionTool = True
+    negated = {v.get("name") for v in root.iter("ScalarVariable") if v.get("alias") == _NEGATED}
+    description.modelVariables = [v for v in description.modelVariables if v.name not in negated]
+    return description
 
 
 def fitted(source: tuple[About, str], target: tuple[About, str]) -> Conversion:

@@ -37,6 +37,9 @@ class Binding:
         Called with the name before each call, so that a crash can be told by its last call; a
         function that it returns is called with the result.
 
+    symbol : callable, optional
+        Name of a function in the binary, where that is another one.
+
     Attributes
     ----------
     functions : dict of str to callable
@@ -57,6 +60,7 @@ class Binding:
         where: str,
         needed: Sequence[str] = (),
         trace: Trace | None = None,
+        symbol: Callable[[str], str] = str,
     ) -> None:
         done = None if trace is None else trace("dlopen")
         before = os.getcwd()
@@ -73,7 +77,7 @@ class Binding:
         missing: list[str] = []
         for name, argument_types, result in _signatures(api):
             try:
-                function = getattr(self.dll, name)
+                function = getattr(self.dll, symbol(name))
             except AttributeError:
                 missing.append(name)
                 self.functions[name] = _absent(name, where)

@@ -69,6 +69,8 @@ def callbacks_for(version: int, messages: Messages, key: int) -> Any:
         from fmpy.fmi3 import fmi3LogMessageCallback
 
         return fmi3LogMessageCallback(messages.logger(3))
+    if version == 1:
+        return _callbacks_fmi1(messages, key)
 
     from fmpy import calloc, free
     from fmpy.fmi2 import (
@@ -83,6 +85,30 @@ def callbacks_for(version: int, messages: Messages, key: int) -> Any:
     functions.allocateMemory = ctypes.cast(calloc, fmi2CallbackAllocateMemoryTYPE)
     functions.freeMemory = ctypes.cast(free, fmi2CallbackFreeMemoryTYPE)
     functions.componentEnvironment = messages.environment(key)
+    return functions
+
+
+def _callbacks_fmi1(messages: Messages, key: int) -> Any:
+    """Callbacks of FMI 1.0, where the logger is not given back what tells the instances apart."""
+    from fmpy import calloc, free
+    from fmpy.fmi1 import (
+        fmi1CallbackAllocateMemoryTYPE,
+        fmi1CallbackFreeMemoryTYPE,
+        fmi1CallbackFunctions,
+        fmi1CallbackLoggerTYPE,
+    )
+    from fmpy.fmi3 import fmi3LogMessageCallback
+
+    keep = fmi3LogMessageCallback(messages.logger(3))
+    environment = messages.environment(key)
+
+    def log(_: Any, __: Any, status: int, category: bytes | None, text: bytes | None) -> None:
+        keep(environment, status, category, text)
+
+    functions = fmi1CallbackFunctions()
+    functions.logger = fmi1CallbackLoggerTYPE(log)
+    functions.allocateMemory = ctypes.cast(calloc, fmi1CallbackAllocateMemoryTYPE)
+    functions.freeMemory = ctypes.cast(free, fmi1CallbackFreeMemoryTYPE)
     return functions
 
 

@@ -36,6 +36,11 @@ class EventInfo:
 def update_discrete_states(instance: FmuInstance) -> EventInfo:
     """In Event Mode: update the discrete states once."""
     by = ctypes.byref
+    if instance.file.version == 1:
+        from posmas_fmi.fmu.fmi1 import Fmi1Model
+
+        assert isinstance(instance, Fmi1Model)
+        return instance.update_discrete_states()
     if instance.file.version == 2:
         from fmpy.fmi2 import fmi2EventInfo
 
@@ -80,4 +85,5 @@ def settle(instance: FmuInstance) -> float:
 
 
 def _name(instance: FmuInstance) -> str:
-    return "NewDiscreteStates" if instance.file.version == 2 else "UpdateDiscreteStates"
+    names = {1: "EventUpdate", 2: "NewDiscreteStates", 3: "UpdateDiscreteStates"}
+    return names[instance.file.version]

@@ -43,7 +43,7 @@ class FmuFile:
     path : Path
     about : About
         What the file says about itself.
-    version : {2, 3}
+    version : {1, 2, 3}
         FMI version.
     token : str
         GUID or instantiationToken.
@@ -136,7 +136,7 @@ class FmuFile:
         where = str(self.path)
         if not is_file_name(identifier):
             raise ArchiveError(f"the modelIdentifier {identifier!r} is no file name", where)
-        binaries = fmpy.platform if self.version == 2 else fmpy.platform_tuple
+        binaries = fmpy.platform if self.version < 3 else fmpy.platform_tuple
         name = identifier + fmpy.sharedLibraryExtension
         self.library = self.folder / "binaries" / binaries / name
         if not self.library.is_file():

@@ -98,7 +98,7 @@ class FmuInstance:
         self._live = file._live[key]
         self.component = self._live.component
         self._prefix = f"fmi{file.version}"
-        self._real = "Real" if file.version == 2 else "Float64"
+        self._real = "Real" if file.version < 3 else "Float64"
         self._state = "FMUstate" if file.version == 2 else "FMUState"
         self._status = 0  # of the last call
         self._free = weakref.finalize(self, free_instance, file._live, key, file._frees)

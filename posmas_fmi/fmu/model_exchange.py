@@ -156,7 +156,7 @@ class ModelExchangeInstance(FmuInstance):
     def derivatives(self) -> Array:
         """Return the derivatives of the continuous states, (n_states,)."""
         version = self.file.version
-        name = "GetDerivatives" if version == 2 else "GetContinuousStateDerivatives"
+        name = "GetDerivatives" if version < 3 else "GetContinuousStateDerivatives"
         return self._vector(name, self.n_states)
 
     def nominals(self) -> Array:

@@ -11,6 +11,7 @@ from posmas_fmi.fmu.binding import Trace
 from posmas_fmi.fmu.callbacks import Messages
 from posmas_fmi.fmu.event_mode import EventFile, needs_event_mode
 from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.fmi1 import Fmi1File, Fmi1SteppedFile
 from posmas_fmi.fmu.stepped import SteppedFile
 
 
@@ -38,6 +39,8 @@ def open_fmu(
             str(path),
         )
     kind: type[FmuFile] = FmuFile if about.kind == "Co-Simulation" else SteppedFile
+    if about.version == 1:
+        kind = Fmi1File if about.kind == "Co-Simulation" else Fmi1SteppedFile
     if needs_event_mode(about):
         kind = EventFile
     return kind(path, messages, trace, unpacked, structure)

@@ -23,7 +23,7 @@ WHOLE = frozenset(
     {"Integer", "Boolean", "Enumeration"}
     | {f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)}
 )
-_DOUBLES = {2: "Real", 3: "Float64"}
+_DOUBLES = {1: "Real", 2: "Real", 3: "Float64"}
 _LARGEST_NAMED = 100_000  # elements of an array that can be called by name
 
 
@@ -164,10 +164,10 @@ def kind_of(variable: Variable, version: int) -> tuple[str, np.dtype[Any]]:
     """Return by which function, and as which type, the values of a variable are exchanged."""
     kind = variable.type
     if kind == "Enumeration":
-        kind = "Integer" if version == 2 else "Int64"
+        kind = "Integer" if version < 3 else "Int64"
     if kind in ("Real", "Float64"):
         return kind, np.dtype(float)
-    if version == 2:
+    if version < 3:
         return kind, np.dtype(np.int32)
     return kind, np.dtype(bool if kind == "Boolean" else kind.lower())
 

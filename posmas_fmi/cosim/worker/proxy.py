@@ -117,7 +117,7 @@ class RemoteInstance(FmuInstance):
         self.time = 0.0
         self.component = 0
         self._prefix = f"fmi{file.version}"
-        self._real = "Real" if file.version == 2 else "Float64"
+        self._real = "Real" if file.version < 3 else "Float64"
         self.start: tuple[dict[str, Any], float, float | None, float | None] | None = None
         self.worker, self._freed = worker, True
 

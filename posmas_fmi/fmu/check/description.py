@@ -142,22 +142,26 @@ def _root(told: Description) -> Iterator[Finding]:
 def _interfaces(told: Description) -> Iterator[Finding]:
     if told.major == 1:
         yield Finding(
-            "error",
+            "note",
             "fmi1",
             _PLACE,
-            "this is FMI 1.0: 'posmas-fmi run' takes FMI 2.0 and 3.0",
-            "export it again, or wrap it in an FMU of FMI 2.0",
+            "this is FMI 1.0: its calls go through Python, and it has no saved states",
+            "steps cannot be repeated, and a run goes on from a snapshot by doing all again",
         )
     elif told.interface("Co-Simulation") is None:
         kinds = " and ".join(i.kind for i in told.interfaces)
         continuous = told.interface("Model Exchange") is not None
         yield Finding(
-            "error" if continuous else "fatal",
+            "warning" if continuous else "fatal",
             "no-co-simulation",
             _PLACE,
-            f"it has {kinds} only: 'posmas-fmi run' takes Co-Simulation",
-            "export it for Co-Simulation"
-            + ("; linearise and fit work as it is" if continuous else ""),
+            f"it has {kinds} only: "
+            + (
+                "an integrator here takes it through time, at about a millisecond per step"
+                if continuous
+                else "'posmas-fmi run' takes Co-Simulation and Model Exchange"
+            ),
+            "export it for Co-Simulation" + (" if that is too slow" if continuous else ""),
         )
     for interface in told.interfaces:
         yield from _capabilities(told, interface)

@@ -18,6 +18,7 @@ from posmas_fmi.fmu.check.journal import Journal, TrialMessages
 from posmas_fmi.fmu.check.surroundings import descriptors, resident, threads
 from posmas_fmi.fmu.evaluation import default_step, saves_state, start_time
 from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.fmi1 import Fmi1File, Fmi1SteppedFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
 from posmas_fmi.fmu.variables import Ports
@@ -53,6 +54,8 @@ class Job:
         Whether only one instance is allowed per process.
     serialises : bool
         Whether states can be serialised.
+    major : int
+        FMI version.
     """
 
     fmu: str
@@ -64,6 +67,7 @@ class Job:
     phases: tuple[str, ...]
     single: bool = False
     serialises: bool = False
+    major: int = 2
 
 
 class Trial:
@@ -76,7 +80,10 @@ class Trial:
     @cached_property
     def file(self) -> FmuFile:
         """The FMU; loaded when it is first asked for."""
-        kind = FmuFile if self.job.interface == "Co-Simulation" else ModelExchangeFile
+        co_simulation = self.job.interface == "Co-Simulation"
+        kind: type[FmuFile] = FmuFile if co_simulation else ModelExchangeFile
+        if self.job.major == 1:
+            kind = Fmi1File if co_simulation else Fmi1SteppedFile
         return kind(self.job.fmu, self.messages, self.journal.call, Path(self.job.unpacked))
 
     def run(self) -> None:
@@ -277,6 +284,11 @@ def life(trial: Trial) -> None:
 
 def reset(trial: Trial) -> None:
     """Whether an instance that was reset does the same again."""
+    if trial.job.major == 1 and trial.job.interface == "Model Exchange":
+        trial.journal.note(
+            "note", "no-reset", "Reset", "FMI 1.0 cannot reset a Model Exchange instance"
+        )
+        return
     with trial.started("reset") as instance:
         first = trial.response(instance)
         instance.reset()
@@ -295,6 +307,9 @@ def reset(trial: Trial) -> None:
 
 def rollback(trial: Trial) -> None:
     """Whether steps can be done again from a saved state, and how exactly."""
+    if trial.job.major == 1:
+        text = "FMI 1.0 has no saved states: going back to one was not tried"
+        trial.journal.note("note", "no-saved-state", "SetFMUState", text)
     if not saves_state(trial.file):
         return
     with trial.started("rollback") as instance:
@@ -448,6 +463,12 @@ def _for_control(trial: Trial) -> FmuFile:
     """Load the FMU as `linearise` does: for Model Exchange, if it can that."""
     job = trial.job
     arguments = (job.fmu, trial.messages, trial.journal.call, Path(job.unpacked))
+    if job.major == 1:
+        return (
+            Fmi1File(*arguments)
+            if job.interface == "Co-Simulation"
+            else Fmi1SteppedFile(*arguments)
+        )
     if trial.file.description.modelExchange is not None:
         with suppress(FmuError):
             return ModelExchangeFile(*arguments)

@@ -167,6 +167,7 @@ def _job(
         "inputs": tuple(inputs),
         "outputs": tuple(outputs),
         "values": values,
+        "major": told.major,
         "single": interface.has("canBeInstantiatedOnlyOncePerProcess"),
         "serialises": interface.has("canSerializeFMUstate")
         or interface.has("canSerializeFMUState"),
@@ -181,8 +182,6 @@ def _tried(
     bounds: Bounds | None,
     control: bool,
 ) -> Outcome:
-    if told.major == 1:
-        return Outcome((Finding("note", "not-tried", "", "an FMU of FMI 1.0 is not run"),))
     if supervisor is not None:
         return supervisor.examine(path, job, bounds, control)
     with Supervisor(bounds) as own:
