@@ -4,11 +4,14 @@ import json
 
 import numpy as np
 import pytest
+import sympy
 
 from posmas_fmi.certify.proof import rational
-from posmas_fmi.design import paper
-from posmas_fmi.design.ledger import Entry, ledger, riccati, to_text
-from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2
+from posmas_fmi.design import ledger_steps, paper
+from posmas_fmi.design.ledger import ledger, to_text
+from posmas_fmi.design.ledger_entry import Entry
+from posmas_fmi.design.ledger_steps import riccati
+from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2, Example
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +63,22 @@ def test_P_of_example_2_is_printed_with_an_entry_of_example_1() -> None:
     assert round(float(riccati(EXAMPLE_1)[1, 1]), 4) == EXAMPLE_1.P[1][1]
     assert round(float(riccati(EXAMPLE_2)[1, 1]), 4) == 0.1373
     assert EXAMPLE_2.P[1][1] == EXAMPLE_1.P[1][1]
+
+
+@pytest.mark.parametrize("example", [EXAMPLE_1, EXAMPLE_2])
+def test_the_solution_of_14_is_proved(example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
+    P, proved = ledger_steps.solution_of_14(example)
+    assert proved
+    assert np.array(P, dtype=float) == pytest.approx(riccati(example), abs=1e-9)
+    wrong = riccati(example) + np.diag([0.0, 1e-4])
+    monkeypatch.setattr(ledger_steps, "riccati", lambda _: wrong)
+    assert not ledger_steps.solution_of_14(example)[1]
+
+
+def test_a_printed_root_that_is_off_by_a_digit_is_seen() -> None:
+    square = sympy.Poly(sympy.Symbol("x") ** 2 - 2)
+    assert ledger_steps.changes_sign(square, 1.4142)
+    assert not ledger_steps.changes_sign(square, 1.4143)
 
 
 def test_infeasibility_vector_is_exact() -> None:

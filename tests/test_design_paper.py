@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from posmas_fmi.design import DesignSettings, design
-from posmas_fmi.design.paper import Reading, active, algorithm, gammas
+from posmas_fmi.design.paper import active, algorithm, gammas
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2, Example
-from posmas_fmi.errors import DesignError
+from posmas_fmi.design.settings import Reading
+from posmas_fmi.errors import DesignError, InputError
 
 
 def settings(example: Example, **changes: object) -> DesignSettings:
@@ -139,3 +140,32 @@ def test_joint_form_can_be_chosen() -> None:
     made = design(example.agent("tanh"), example.network(2), chosen, 0.005)
     assert made.form == "joint"
     assert "joint" in made.notes[0]
+
+
+def test_a_reading_of_the_text_is_chosen_in_a_scenario() -> None:
+    """Only a symmetric E is printed; any E does at least as well."""
+    alphas = []
+    for symmetric in (True, False):
+        reading = {"coupling": "L + D", "order": "rigorous", "s": 0.5, "symmetric_E": symmetric}
+        chosen = settings(EXAMPLE_1, method="paper-1", form="printed", reading=reading)
+        made = design(EXAMPLE_1.agent(), EXAMPLE_1.network(1), chosen, 0.005)
+        kind = "symmetric" if symmetric else "free"
+        assert f"a(L + D), s = 0.5, eigenvalues rigorous, E {kind}" in made.notes[0]
+        assert bool(made.E[0, 1] == made.E[1, 0]) is symmetric
+        alphas.append(float(made.notes[0].partition("alpha = ")[2].partition(",")[0]))
+    assert alphas[1] <= alphas[0] + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("reading", "place"),
+    [
+        ({"order": "random"}, "$.design.reading.order"),
+        ({"s": -1.0}, "$.design.reading.s"),
+        ({"sigma": 1.0}, "$.design.reading"),
+        ("L - D", "$.design.reading"),
+    ],
+)
+def test_readings_that_there_are_not_are_refused(reading: object, place: str) -> None:
+    with pytest.raises(InputError) as caught:
+        settings(EXAMPLE_1, reading=reading)
+    assert caught.value.where == place

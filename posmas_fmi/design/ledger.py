@@ -6,54 +6,20 @@ only when the printed, rounded inputs are used), "contradicted" or "infeasible".
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any, Literal
 
-import attrs
 import numpy as np
 
 from posmas_fmi.certify import Loop
-from posmas_fmi.certify.proof import exactly_positive, identity, rational, refuted
+from posmas_fmi.certify.proof import identity, rational, refuted
 from posmas_fmi.design import paper
+from posmas_fmi.design.ledger_entry import VERDICTS, Entry, agrees, show
+from posmas_fmi.design.ledger_steps import residual, riccati, steps
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2, EXAMPLES, Example
 from posmas_fmi.design.settings import DesignSettings
 from posmas_fmi.design.simulate import simulate
-from posmas_fmi.expression import Array
-
-Verdict = Literal["reproduced", "rounded", "contradicted", "infeasible"]
-
-
-@attrs.frozen
-class Entry:
-    """One line of the ledger.
-
-    Attributes
-    ----------
-    place : str
-        Example, algorithm or equation.
-    item : str
-        What is printed.
-    printed, computed : str
-    verdict : {"reproduced", "rounded", "contradicted", "infeasible"}
-    proof : str
-        What a reader can check by hand or in exact arithmetic.
-    erratum : int or None
-        Number in theory.md, section 2.
-    """
-
-    place: str
-    item: str
-    printed: str
-    computed: str
-    verdict: Verdict
-    proof: str
-    erratum: int | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON form."""
-        return attrs.asdict(self)
 
 
 def ledger() -> tuple[Entry, ...]:
@@ -66,7 +32,7 @@ def ledger() -> tuple[Entry, ...]:
     """
     found: list[Entry] = []
     for example in EXAMPLES:
-        found += _steps(example)
+        found += steps(example)
         for which in (1, 2):
             found += _design(example, which)
     found += _errata()
@@ -88,108 +54,9 @@ def to_text(entries: tuple[Entry, ...]) -> str:
             f"    computed: {e.computed}",
             f"    proof:    {e.proof}",
         ]
-    counts = {v: sum(e.verdict == v for e in entries) for v in _VERDICTS}
+    counts = {v: sum(e.verdict == v for e in entries) for v in VERDICTS}
     lines += ["", ", ".join(f"{n} {v}" for v, n in counts.items())]
     return "\n".join(lines).lstrip("\n")
-
-
-_VERDICTS: tuple[Verdict, ...] = ("reproduced", "rounded", "contradicted", "infeasible")
-
-
-def _show(value: Any, digits: int = 4) -> str:
-    array = np.asarray(value)
-    if array.ndim == 0:
-        return f"{complex(array):.{digits}f}" if np.iscomplexobj(array) else f"{array:.{digits}f}"
-    return "[" + ", ".join(_show(row, digits) for row in array) + "]"
-
-
-def _agrees(printed: Any, computed: Any, digits: int) -> bool:
-    """Whether every number is the printed one when rounded (or cut) to the printed digits."""
-    unit = 10.0**-digits
-    difference = np.abs(np.asarray(printed) - np.asarray(computed))
-    return bool(difference.max() <= unit * (1 + 1e-9))
-
-
-# -- steps 1 and 2 of the algorithms ------------------------------------------------------------
-
-
-def riccati(example: Example) -> Array:
-    """Smallest solution P of (14)."""
-    import scipy.linalg
-
-    F = np.array(example.A) - np.array(example.E0) @ np.array(example.C)
-    bound = (example.beta * np.linalg.norm(example.H, 2)) ** 2
-    m = len(F)
-    hamiltonian = np.block([[F, bound * np.eye(m)], [-(1 + example.delta) * np.eye(m), -F.T]])
-    _, U, stable = scipy.linalg.schur(hamiltonian, sort="lhp")
-    if stable != m:
-        raise ArithmeticError("(14) has no stabilising solution")
-    P = np.linalg.solve(U[:m, :m].T, U[m:, :m].T).T
-    return np.asarray(0.5 * (P + P.T))
-
-
-def _residual(example: Example, P: Any) -> Any:
-    """``FᵀP + PF + (β‖H‖)²PP + I`` with a rational upper bound of ‖H‖."""
-    A, C, E0 = rational(example.A), rational(example.C), rational(example.E0)
-    F = A - E0 @ C
-    bound = Fraction(math.ceil(1e9 * float(np.linalg.norm(example.H, 2)) ** 2 + 1), 10**9)
-    return F.T @ P + P @ F + bound * (P @ P) + identity(len(A))
-
-
-def _steps(ex: Example) -> Iterator[Entry]:
-    place = ex.name
-    norm = float(np.linalg.norm(ex.H, 2))
-    yield Entry(
-        place,
-        "||H||",
-        _show(ex.norm_H),
-        _show(norm, 6),
-        "reproduced" if _agrees(ex.norm_H, norm, 4) else "contradicted",
-        "largest singular value: root of x^2 - tr(H^T H) x + det(H)^2",
-    )
-    spectrum = np.sort_complex(np.linalg.eigvals(ex.network(1).laplacian.toarray()))
-    wanted = np.sort_complex(np.array([z for z in ex.spectrum if z != 0]))
-    yield Entry(
-        place,
-        "spectrum of L (which recovers the digraph that the figure shows)",
-        _show(np.asarray(ex.spectrum)),
-        _show(np.round(spectrum, 6)),
-        "reproduced" if _agrees(wanted, spectrum[np.abs(spectrum) > 1e-9], 4) else "contradicted",
-        f"arcs {list(ex.arcs)}; node labels stay unknown",
-    )
-    printed_P = rational(ex.P)
-    residual = _residual(ex, printed_P)
-    proved = exactly_positive(-residual) and exactly_positive(printed_P)
-    F = np.array(ex.A) - np.array(ex.E0) @ np.array(ex.C)
-    yield Entry(
-        place,
-        "E_0 satisfies (13)",
-        f"sigma_min(A - E_0 C - jwI) > {norm:.4f}",
-        f"A - E_0 C = {_show(F)}",
-        "reproduced" if proved else "contradicted",
-        "bounded real lemma: the printed P > 0 makes the left side of (14) without delta negative "
-        "definite, by exact rational LDL^T",
-    )
-    P = riccati(ex)
-    agree = _agrees(ex.P, P, 4)
-    yield Entry(
-        place,
-        "P of (14)",
-        _show(ex.P),
-        _show(P, 5),
-        "reproduced" if agree else "contradicted",
-        "stabilising solution by the Schur method"
-        + ("" if agree else "; the printed P_22 is the one of Example 1"),
-    )
-    sigma = np.array(residual, dtype=float)
-    yield Entry(
-        place,
-        "Sigma",
-        _show(ex.Sigma),
-        f"{_show(sigma, 5)} from the printed P; {-ex.delta:g} I from the exact P",
-        "rounded" if _agrees(ex.Sigma, sigma, 4) else "contradicted",
-        "(14) makes Sigma = -delta I exactly; the printed matrix is the residual of the printed P",
-    )
 
 
 # -- the printed designs ------------------------------------------------------------------------
@@ -203,9 +70,9 @@ def _design(ex: Example, which: Literal[1, 2]) -> Iterator[Entry]:
     yield Entry(
         place,
         "K",
-        _show(printed.K, 5),
-        f"{_show(K, 5)} with K = -eta B^T Pi, {_show(inverse, 5)} with Pi^-1",
-        "reproduced" if _agrees(printed.K, K, 4) else "contradicted",
+        show(printed.K, 5),
+        f"{show(K, 5)} with K = -eta B^T Pi, {show(inverse, 5)} with Pi^-1",
+        "reproduced" if agrees(printed.K, K, 4) else "contradicted",
         f"{ex.eta:g} * {ex.B[0][0]:g} * {printed.Pi:g} = "
         f"{ex.eta * ex.B[0][0] * printed.Pi:.5f}; condition 1 of Theorem 1 needs Pi^-1",
         erratum=6,
@@ -257,7 +124,7 @@ def _signs(ex: Example, which: Literal[1, 2], place: str) -> Iterator[Entry]:
         "holds",
         f"least off-diagonal entry {float(least):.4f}",
         "reproduced" if least >= 0 else "contradicted",
-        f"exact: EC = {_show(np.array(EC, dtype=float), 5)}, times {float(factor):g}",
+        f"exact: EC = {show(np.array(EC, dtype=float), 5)}, times {float(factor):g}",
     )
     lowest = EC.min()
     yield Entry(
@@ -357,7 +224,7 @@ def _infeasible() -> Entry:
         "feasible, alpha = -12.855",
         f"infeasible: A has the eigenvalue {top:+.4f}",
         "infeasible",
-        f"w = ({', '.join(f'{x:g}' for x in w)}): w^T A = {_show(row)} >= 0 exactly, hence "
+        f"w = ({', '.join(f'{x:g}' for x in w)}): w^T A = {show(row)} >= 0 exactly, hence "
         "w^T Sym(A Pi) w >= 0 for every diagonal Pi > 0",
         erratum=3,
     )
@@ -393,9 +260,9 @@ def _definitions() -> Iterator[Entry]:
         "Theorem 1",
         "gamma_i pairs the i-th eigenvalue of Gamma L L^T Gamma with f_i",
         "lambda_i / f_i",
-        f"pairs {_show(sorted_pairs)}, all below or at what is needed for every i: {rigorous:.4f}"
+        f"pairs {show(sorted_pairs)}, all below or at what is needed for every i: {rigorous:.4f}"
         if sorted_pairs.max() <= rigorous
-        else f"pairs {_show(sorted_pairs)}; needed for every i: {rigorous:.4f}",
+        else f"pairs {show(sorted_pairs)}; needed for every i: {rigorous:.4f}",
         "contradicted",
         "Gamma and Gamma L L^T Gamma do not commute (norm of the commutator "
         f"{np.linalg.norm(commutator):.3g}), and s is a vector in a scalar formula",
@@ -462,7 +329,7 @@ def _misprints() -> Iterator[Entry]:
     )
     P = riccati(EXAMPLE_2)
     rounded = rational(np.round(P, 4))
-    sigma = np.array(_residual(EXAMPLE_2, rounded), dtype=float)
+    sigma = np.array(residual(EXAMPLE_2, rounded), dtype=float)
     yield Entry(
         "Example 2",
         "Sigma_22 = -0.0080",
@@ -470,7 +337,7 @@ def _misprints() -> Iterator[Entry]:
         f"{sigma[1, 1]:.4f} from P rounded to 4 digits, -0.0200 from the exact P",
         "rounded",
         f"P_22 = {P[1, 1]:.5f}, but 0.1357 of Example 1 is printed; with that P the residual is "
-        f"{float(_residual(EXAMPLE_2, rational(EXAMPLE_2.P))[1, 1]):.5f}",
+        f"{float(residual(EXAMPLE_2, rational(EXAMPLE_2.P))[1, 1]):.5f}",
         erratum=12,
     )
 

@@ -17,7 +17,7 @@ from posmas_fmi.design import lmi
 from posmas_fmi.design.gains import certified
 from posmas_fmi.design.result import Design
 from posmas_fmi.design.rounding import nearest
-from posmas_fmi.design.settings import DesignSettings
+from posmas_fmi.design.settings import DesignSettings, Reading
 from posmas_fmi.design.solver import cvxpy, solve
 from posmas_fmi.errors import DesignError
 from posmas_fmi.expression import Array
@@ -28,29 +28,6 @@ _ROUNDS = 10
 _TANGENTS = 50
 _LARGEST_PI = 2.0  # with Π free α has no minimum
 _SMALLEST_F = 1e-12
-
-
-@attrs.frozen
-class Reading:
-    """How to read what the text leaves open.
-
-    Attributes
-    ----------
-    coupling : {"L - D", "L + D"}
-        Matrix in a(·); the first is printed.
-    s : float
-        The leader's state in the scalar γ_i (erratum 7): some number has to stand for a vector.
-    order : {"ascending", "descending", "rigorous"}
-        Which eigenvalue of ΓLLᵀΓ goes with which f_i; "rigorous" takes the largest of
-        ``Γ^{-1/2} (ΓLLᵀΓ) Γ^{-1/2}`` for every i.
-    symmetric_E : bool
-        Search over symmetric E only, as the printed values show (erratum 11).
-    """
-
-    coupling: Literal["L - D", "L + D"] = "L - D"
-    s: float = 1.0
-    order: Literal["ascending", "descending", "rigorous"] = "ascending"
-    symmetric_E: bool = True
 
 
 @attrs.frozen(eq=False)
@@ -338,9 +315,10 @@ def design(
                 '(erratum 3); use form = "corrected" or method = "contraction"',
                 "$.design.method",
             )
-    conditions = algorithm(agent, network, which, settings)
     joint = settings.form == "joint"
-    found = conditions.joint(symmetric=False) if joint else conditions.run(symmetric=True)
+    reading = settings.reading or Reading(symmetric_E=not joint)
+    conditions = algorithm(agent, network, which, settings, reading)
+    found = (conditions.joint if joint else conditions.run)(reading.symmetric_E)
     if found.alpha > 0:
         raise DesignError(
             f"Algorithm {which} stops at alpha = {found.alpha:.4g} > 0 after {found.rounds} "
@@ -352,7 +330,7 @@ def design(
     notes = (
         f"Algorithm {which} {'in joint form' if joint else 'as printed'}: "
         f"alpha = {found.alpha:.6g}, Pi = {found.Pi.tolist()}, "
-        f"{found.lmis} of {network.N} LMIs can be active, K = -eta B^T Pi",
+        f"{found.lmis} of {network.N} LMIs can be active, K = -eta B^T Pi; reading: {reading}",
         "the paper's conditions do not prove the closed loop (errata 3 to 9); the certificate is "
         "that of theory.md, section 4",
     )

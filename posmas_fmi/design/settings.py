@@ -26,11 +26,11 @@ def _optional_matrix(value: Any) -> Array | None:
     return array
 
 
-def _one_of(*allowed: str) -> Any:
+def _one_of(*allowed: object) -> Any:
     def check(_: object, attribute: Any, value: object) -> None:
         if value not in allowed:
             raise InputError(
-                f"expected one of {', '.join(allowed)} (got {value!r})",
+                f"expected one of {', '.join(map(str, allowed))} (got {value!r})",
                 f"$.design.{attribute.name}",
             )
 
@@ -43,6 +43,54 @@ def _positive(_: object, attribute: Any, value: object) -> None:
         raise InputError(
             f"expected a finite number > 0 (got {value!r})", f"$.design.{attribute.name}"
         )
+
+
+@attrs.frozen
+class Reading:
+    """``[design.reading]``: how to read what the text of Algorithms 1 and 2 leaves open.
+
+    Attributes
+    ----------
+    coupling : {"L - D", "L + D"}
+        Matrix in a(·); the first is printed.
+    s : float
+        The leader's state in the scalar γ_i (erratum 7): some number has to stand for a vector.
+    order : {"ascending", "descending", "rigorous"}
+        Which eigenvalue of ``ΓLLᵀΓ`` goes with which f_i; "rigorous" takes the largest of
+        ``Γ^{-1/2} (ΓLLᵀΓ) Γ^{-1/2}`` for every i.
+    symmetric_E : bool
+        Search over symmetric E only, as the printed values show (erratum 11).
+    """
+
+    coupling: Literal["L - D", "L + D"] = attrs.field(
+        default="L - D", validator=_one_of("L - D", "L + D")
+    )
+    s: float = attrs.field(default=1.0, validator=_positive)
+    order: Literal["ascending", "descending", "rigorous"] = attrs.field(
+        default="ascending",
+        validator=_one_of("ascending", "descending", "rigorous"),
+    )
+    symmetric_E: bool = attrs.field(default=True, validator=_one_of(True, False))
+
+    def __str__(self) -> str:
+        kind = "symmetric" if self.symmetric_E else "free"
+        return f"a({self.coupling}), s = {self.s:g}, eigenvalues {self.order}, E {kind}"
+
+
+def _optional_reading(value: Any) -> Reading | None:
+    if value is None or isinstance(value, Reading):
+        return value
+    known = [a.name for a in attrs.fields(Reading)]
+    if not isinstance(value, dict) or set(value) - set(known):
+        raise InputError(
+            f"expected a table with keys out of {', '.join(known)} (got {value!r})",
+            "$.design.reading",
+        )
+    try:
+        return Reading(**value)
+    except InputError as error:
+        place = (error.where or "").replace("$.design.", "$.design.reading.")
+        raise InputError(error.message, place) from None
 
 
 @attrs.frozen(eq=False)
@@ -80,6 +128,9 @@ class DesignSettings:
     form : {"corrected", "printed", "joint"}
         Form of Algorithms 1 and 2: route L in their place; as printed; the printed conditions with
         steps 3 and 4 solved jointly.
+    reading : Reading, optional
+        What the text of the algorithms leaves open; as printed by default, in the joint form with
+        any E.
     protocol : {"corrected", "printed"}
         Signs in the running controller: L + D, or as printed (errata 1 and 2).
     digits : int
@@ -129,6 +180,7 @@ class DesignSettings:
     form: Literal["corrected", "printed", "joint"] = attrs.field(
         default="corrected", validator=_one_of("corrected", "printed", "joint")
     )
+    reading: Reading | None = attrs.field(default=None, converter=_optional_reading)
     protocol: Literal["corrected", "printed"] = attrs.field(
         default="corrected", validator=_one_of("corrected", "printed")
     )
