@@ -137,6 +137,23 @@ class Agent:
         return lambda t, X: components(t, *X.T)
 
     @cached_property
+    def g_columns(self) -> Callable[[float, Array, Array], None]:
+        """``g(t, X, out)`` for X and out of shape (m, N): a column per agent, written to out."""
+        if not isinstance(self.g, VectorFunction):
+            function = self.g
+
+            def columns(t: float, X: Array, out: Array) -> None:
+                out[...] = function(t, X.T).T
+
+            return columns
+        components = self.g.numpy()
+
+        def g(t: float, X: Array, out: Array) -> None:
+            components(t, *X, out=out)
+
+        return g
+
+    @cached_property
     def sec_numpy(self) -> Callable[[Array], Array]:
         """``sec(U)`` for U of shape (N, p), giving (N, p)."""
         if not isinstance(self.sec, VectorFunction):

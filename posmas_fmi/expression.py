@@ -385,15 +385,17 @@ class VectorFunction:
         Returns
         -------
         callable
-            ``f(*values)`` with values of shape ``(...)`` gives shape ``(..., len(self))``.
+            ``f(*values)`` with values of shape ``(...)`` gives shape ``(..., len(self))``. With
+            ``out`` of shape ``(len(self), ...)`` it writes there, components on the first axis.
         """
         code = sympy.lambdify(
             self.symbols, list(self.expressions), "numpy", printer=_ExactNumpy, cse=True
         )
 
-        def evaluate(*values: Any) -> Array:
+        def evaluate(*values: Any, out: Array | None = None) -> Array:
             # each component in one piece, seen with the components on the last axis
-            out = np.empty((len(self.expressions), *np.broadcast(*values).shape))
+            if out is None:
+                out = np.empty((len(self.expressions), *np.broadcast(*values).shape))
             for k, component in enumerate(code(*values)):
                 out[k] = component
             return out if out.ndim == 1 else out.transpose(*range(1, out.ndim), 0)

@@ -17,7 +17,15 @@ import numpy as np
 
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.failure import Failure
-from posmas_fmi.cosim.fmus import FmuLoop, Fmus, Incident, NativeMessages, PortMap, Whole
+from posmas_fmi.cosim.fmus import (
+    READING,
+    FmuLoop,
+    Fmus,
+    Incident,
+    NativeMessages,
+    PortMap,
+    Whole,
+)
 from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerProcess, require
@@ -158,7 +166,7 @@ class FmuPlant:
         self.isolated = self._remote is not None
         self.input_at, self.reading_at = self.fmus.input_at, self.fmus.reading_at
         self.frozen = np.zeros(len(specs), dtype=bool)
-        self._fresh = np.zeros(len(specs), dtype=bool)  # which have been read by their last step
+        self._fresh = False  # what has been stepped last has been read as well
         self.goes_on = isolation.on_failure != "stop" and library is not None
         self._incidents = (Incident * len(specs))() if self.goes_on else None
         self._loop = None
@@ -214,12 +222,15 @@ class FmuPlant:
         return cls(whole, states is not None, stop, isolation)
 
     def read(self, which: Whole, time: float, readings: Array) -> None:
-        """Write the readings of some instances into those of all."""
+        """Write the readings of some instances into those of all; see `Plant.read`."""
+        if self._fresh and self._loop is not None:
+            self._fresh = False
+            self._loop.check_readings(time)
+            return
         if self._loop is not None:
             before = readings.copy() if self.goes_on else readings
-            self._loop.read(which[~self._fresh[which]], time, readings)
-            self._fresh[which] = False
-            self._freeze(time, readings, before)
+            self._loop.read(which, time, readings)
+            self._freeze(time, time, readings, before)
             return
         for number in which:
             instance, ports = self._instances[number], self._specs[number].readings
@@ -233,9 +244,8 @@ class FmuPlant:
             self.fmus.inputs = inputs
             before = readings.copy() if self.goes_on else readings
             self._loop.step(which, t, h, inputs, readings)
-            if self._remote is not None:
-                self._fresh[which] = self._remote.is_remote[which] != 0
-            self._freeze(float(t[0]), readings, before)
+            self._fresh = True
+            self._freeze(float(t[0]), float(t[0] + h[0]), readings, before)
             return
         for number, begin, length in zip(which, t, h, strict=True):
             instance, ports = self._instances[number], self._specs[number].inputs
@@ -247,14 +257,14 @@ class FmuPlant:
                 instance.set_input_derivatives(instance.file.ports(ports.rates), rates)
             instance.do_step(float(begin), float(length))
 
-    def _freeze(self, time: float, readings: Array, before: Array) -> None:
-        """Leave instances that have failed as they were."""
+    def _freeze(self, begin: float, end: float, readings: Array, before: Array) -> None:
+        """Leave instances that have failed as they were, in a step from begin to end [s]."""
         if self._incidents is None:
             return
         for number, incident in enumerate(self._incidents):
             if incident.call:
                 if not self.fmus.is_remote(number):  # they tell themselves
-                    self.fmus.freeze(incident, time)
+                    self.fmus.freeze(incident, end if incident.call in READING else begin)
                 self.frozen[number] = True
                 at = slice(self.reading_at[number], self.reading_at[number + 1])
                 readings[at] = before[at]

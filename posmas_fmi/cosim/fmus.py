@@ -159,6 +159,7 @@ _CALLS = (
 )
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
 DIED, DEADLINE, INTERRUPTED = 8, 9, 10  # of an FMU in another process
+READING = (6, _NOT_FINITE)  # calls after a step
 
 
 def call_name(call: int, fmi: int) -> str:
@@ -533,9 +534,10 @@ class FmuLoop:
         self._read.argtypes = [_pointer, _pointer, _int, *(_pointer,) * 4]
         self._step.restype = self._read.restype = None
         self._scratch = np.zeros(fmus.room)
+        self._unread = Report()  # of the last step: an FMU that could not be read after it
 
     def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
-        """Set the inputs of some instances and let them step.
+        """Set the inputs of some instances, let them step, and write their readings.
 
         Parameters
         ----------
@@ -544,14 +546,13 @@ class FmuLoop:
         t, h : (n,) array
             From where, and how far [s].
         inputs, readings : array
-            Of all instances, one after the other; the readings of those in other processes are
-            written.
+            Of all instances, one after the other.
 
         Raises
         ------
         FmuCallError
-            For the first FMU that fails, unless incidents are noted; those after it have not
-            stepped.
+            For the first FMU that cannot be stepped, unless incidents are noted; those after it
+            have not stepped. One that cannot be read is for `check_readings`.
         """
         report = Report()
         self._step(
@@ -566,7 +567,20 @@ class FmuLoop:
             ctypes.addressof(report),
             self._incidents,
         )
+        self._unread = Report()
+        if report.failure.call in READING:
+            self._unread.failure, report.failure = report.failure, Incident()
         self._check(report, float(t[0]) if len(t) else 0.0)
+
+    def check_readings(self, t: float) -> None:
+        """Raise what the last step, which ended at t [s], could not read.
+
+        Raises
+        ------
+        FmuCallError
+            For the first FMU.
+        """
+        self._check(self._unread, t)
 
     def read(self, which: Whole, t: float, readings: Array) -> None:
         """Write the readings of some instances into those of all.

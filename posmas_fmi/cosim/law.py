@@ -30,8 +30,9 @@ class Heard:
         Messages.
     held : (arcs,) array of int
         Which of them is the last one over each arc between agents.
-    leader : (N, w) array
-        Last message from the leader; zero where an agent is not pinned.
+    from_leader : (pinned, w) array
+        Last message from the leader, of each pinned agent.
+    pinned : (pinned,) array of int
     silence : (N, 2) array
         How long ago the oldest of the last messages from neighbours was sent, and that of the
         leader [s].
@@ -39,8 +40,17 @@ class Heard:
 
     pool: Array
     held: np.ndarray[tuple[int], np.dtype[np.int64]]
-    leader: Array
+    from_leader: Array
+    pinned: np.ndarray[tuple[int], np.dtype[np.int64]]
     silence: Array
+
+    @property
+    def leader(self) -> Array:
+        """Last message from the leader, (N, w); zero where an agent is not pinned."""
+        messages = columns(len(self.silence), self.pool.shape[1])
+        messages[:] = 0.0
+        messages[self.pinned] = self.from_leader
+        return messages
 
     @property
     def messages(self) -> Array:
@@ -59,8 +69,9 @@ class Weights:
     ----------
     own, leader, own_innovation : (N,) array
     heard, heard_innovation : (N, arcs) sparse array
-        Of arcs, or of the pool of messages; see `through`.
     innovation : int
+    at_once : sparse array, optional
+        Where all messages arrive at once: the weights of (6) as one matrix, see `arriving`.
     """
 
     own: Array
@@ -69,6 +80,7 @@ class Weights:
     own_innovation: Array
     heard_innovation: sp.csr_array
     innovation: int = 0
+    at_once: sp.csr_array | None = None
 
     @classmethod
     def of(cls, protocol: Protocol, innovation: int) -> Weights:
@@ -83,39 +95,41 @@ class Weights:
         )
 
     def disagreement(self, sent: Array, heard: Heard) -> Array:
-        """Weighted disagreement of each agent with what it has heard, (N, w).
-
-        The weights must be those of the pool that `heard` has.
-        """
-        first = sent.shape[1] - self.innovation
-        result = columns(*sent.shape)
-        main, rest = result[:, :first], result[:, first:]
-        np.multiply(self.own[:, None], sent[:, :first], out=main)
-        np.multiply(self.own_innovation[:, None], sent[:, first:], out=rest)
-        main -= self.heard @ heard.pool[:, :first]
-        main -= self.leader[:, None] * heard.leader[:, :first]
-        if self.heard_innovation.nnz:
-            rest -= self.heard_innovation @ heard.pool[:, first:]
+        """Weighted disagreement of each agent with what it has heard, (N, w)."""
+        N, width = sent.shape
+        first = width - self.innovation
+        result = columns(N, width)
+        main, rest = result.T[:first], result.T[first:]  # rows are quantities
+        if self.at_once is not None:  # own estimates, those heard and the leader's in one product
+            main[:] = (self.at_once @ heard.pool.T[:first].ravel()).reshape(first, N)
+        else:
+            np.multiply(self.own, sent.T[:first], out=main)
+            main -= (self.heard @ heard.messages[:, :first]).T
+            main -= self.leader * heard.leader.T[:first]
+        np.multiply(self.own_innovation, sent.T[first:], out=rest)
+        if self.heard_innovation.data.size:
+            rest -= (self.heard_innovation @ heard.messages[:, first:]).T
         return result
 
-    def through(self, held: Array, count: int) -> Weights:
-        """Return weights of a pool of messages instead of arcs.
+    def arriving(self, senders: Array, width: int) -> Weights:
+        """Return weights for messages that all arrive at once.
+
+        Then (6) is one matrix ``[own - heard, -leader]`` times what the agents and, in the last
+        row, the leader have sent.
 
         Parameters
         ----------
-        held : (arcs,) array of int
-            Which message each arc holds.
-        count : int
-            Messages in the pool.
+        senders : (arcs,) array of int
+            Who sends over each arc.
+        width : int
+            Of a message.
         """
-
-        def of_pool(by_arc: sp.csr_array) -> sp.csr_array:
-            entries = by_arc.data, held[by_arc.indices], by_arc.indptr
-            return sp.csr_array(entries, shape=(by_arc.shape[0], count))
-
-        return attrs.evolve(
-            self, heard=of_pool(self.heard), heard_innovation=of_pool(self.heard_innovation)
-        )
+        N, heard = len(self.own), self.heard
+        by_sender = sp.csr_array((heard.data, senders[heard.indices], heard.indptr), shape=(N, N))
+        leader = sp.csr_array(self.leader[:, None])
+        matrix = sp.hstack([sp.diags_array(self.own) - by_sender, -leader])
+        each = sp.block_diag([matrix] * (width - self.innovation), format="csr")
+        return attrs.evolve(self, at_once=sp.csr_array(each))
 
     def without(self, off: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Weights:
         """Leave arcs out of the digraph.
@@ -306,7 +320,7 @@ class ProtocolLaw(CompiledLaw):
         agent = self.agent
         sent = columns(len(memory), agent.m + agent.q)
         sent[:, : agent.m] = memory
-        np.subtract(measured, (agent.C @ memory.T).T, out=sent[:, agent.m :])
+        np.subtract(measured.T, np.dot(agent.C, memory.T), out=sent.T[agent.m :])
         return sent
 
     def step(
@@ -322,15 +336,18 @@ class ProtocolLaw(CompiledLaw):
     ) -> Decision:
         """Equation (6), and the observer over one communication step; the leader runs free."""
         agent, N, m = self.agent, len(memory), self.agent.m
-        disagreement = weights.disagreement(sent, heard)
-        u = (self.protocol.K @ disagreement[:, :m].T).T
-        applied = self.agent.sec_numpy(u)
-        states, held = columns(N + 1, m), columns(N + 1, m)
-        states[:N], states[N] = memory, leader
-        held[:N] = (agent.B @ applied.T + self.protocol.E @ disagreement[:, m:].T).T
-        held[N] = 0.0
-        after = self.propagator(h)(t, states, held)
-        return Decision(u, applied, after[:N], after[N])
+        propagator = self.propagator(h)
+        known = propagator.room(N + 1)  # of the agents and the leader
+        states, held = known[:m], known[m : 2 * m]
+        disagreement = weights.disagreement(sent, heard).T
+        u = np.dot(self.protocol.K, disagreement[:m])
+        applied = self.agent.sec_numpy(u.T)
+        states[:, :N], states[:, N] = memory.T, leader
+        held[:, :N] = np.dot(self.protocol.E, disagreement[m:])
+        held[:, :N] += np.dot(agent.B, applied.T)
+        held[:, N] = 0.0
+        after = propagator.advance(t, known).T
+        return Decision(u.T, applied, after[:N], after[N])
 
     def leader_message(self, memory: Array) -> Array:
         """Return the state, and no innovation."""

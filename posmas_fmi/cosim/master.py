@@ -16,7 +16,7 @@ from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
 from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
 from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.interrupt import Interrupt
-from posmas_fmi.cosim.law import Heard, Law, Weights
+from posmas_fmi.cosim.law import Heard, Law, Weights, columns
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.wiring import Whole, Wiring
 from posmas_fmi.errors import FmuCallError, FmuEndedError
@@ -322,22 +322,26 @@ class Run:
         self.always_draws = self.timeline.has("loss")
         self.at_once = system.channel.ideal and not self.always_draws  # messages arrive
         self.held: Any = system.senders if self.at_once else np.arange(self.arcs)
-        readings_at = plant.reading_at[: N + 1]
-        self.y_of = _taker(readings_at, 0, agent.q)
-        self.x_of = _taker(readings_at, agent.q, agent.m) if plant.shows_states else None
+        self.no_silence = np.zeros((N, 2))
+        shown = agent.q + (agent.m if plant.shows_states else 0)
+        self.table_of = _taker(plant.reading_at[: N + 1], shown)
+        self.y = np.zeros((N, agent.q))  # at k, and the states if they are shown
+        self.x: Array | None = None
         self.u_at = plant.input_at[:N, None] + np.arange(agent.p)
         is_u = np.zeros(plant.input_at[-1], dtype=bool)
         is_u[self.u_at] = True
         self.extra_at = np.flatnonzero(~is_u)
         self.lengths = system.every * system.clock.period / TICKS_PER_SECOND  # of the steps [s]
+        self.everyone = np.arange(system.instances)
         self.in_step = bool((system.every == 1).all())  # every period is one communication step
+        self.all_act = self.in_step  # and none is frozen
         of_agents = system.every[:N]
         self.periods = [(int(period), of_agents == period) for period in np.unique(of_agents)]
         self.recorded = np.array(system.wiring.recorded, dtype=np.int64)
         memory = law.start(system.xhat0)
         leader = law.lead(system.s0)
-        width = len(law.leader_message(leader))
-        empty = np.zeros((self.arcs + len(self.pinned), width))
+        self.width = len(law.leader_message(leader))
+        empty = np.zeros((self.arcs + len(self.pinned), self.width))
         random = np.random.default_rng(system.seed)
         self.state = State(
             k=0,
@@ -406,9 +410,8 @@ class Run:
 
     def _loop(self, interrupt: Interrupt) -> None:
         clock, system, state = self.system.clock, self.system, self.state
-        everyone = np.arange(system.instances)
-        self.plant.read(everyone, 0.0, state.readings)
-        begins = everyone
+        begins = self.everyone
+        self.plant.read(begins, 0.0, state.readings)
         for k in range(clock.steps + 1):
             t = clock.time(k)
             self._change_conditions(k)
@@ -422,18 +425,12 @@ class Run:
             self._step(k)
             self._remember(t, k)
             state.k = k + 1
-            begins = everyone
-            if not self._all_act:
+            if not self.all_act:
                 begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
             self.plant.checkpoint()
             interrupt.check()
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
-
-    @property
-    def _all_act(self) -> bool:
-        """Whether every instance takes every communication step."""
-        return self.in_step and not self.plant.frozen.any()
 
     def _change_conditions(self, k: int) -> None:
         system, state = self.system, self.state
@@ -454,13 +451,15 @@ class Run:
     def _weights(self) -> Weights:
         weights = self.system.weights_with(self.conditions.arc_off)
         if self.at_once:
-            return weights.through(self.held, self.system.network.N)
+            return weights.arriving(self.system.senders, self.width)
         return weights
 
     def _measure(self, k: int, begins: Whole) -> None:
         """Measure y, then the rest, through the sensors."""
         system, state, sensors = self.system, self.state, self.system.sensors
-        value = self.y_of(state.readings)
+        table, q = self.table_of(state.readings), system.agent.q
+        self.y, self.x = table[:q].T, table[q:].T if self.plant.shows_states else None
+        value = self.y
         if system.law.extras:
             rest = system.wiring.take(system.wiring.measured, state.readings, self.drive)
             value = np.concatenate([value, rest], axis=1)
@@ -484,31 +483,31 @@ class Run:
     def _exchange(self, k: int, sent: Array) -> Heard:
         """Send over every arc and from the leader to the pinned; return what is now held."""
         state, N, width = self.state, self.system.network.N, sent.shape[1]
-        law, mailbox = self.system.law, self.state.mailbox
-        from_leader = law.leader_message(state.leader)
-        leader, silence = np.zeros((width, N)).T, np.zeros((N, 2))
+        mailbox, pinned = self.state.mailbox, self.pinned
+        from_leader = self.system.law.leader_message(state.leader)
         if self.at_once:
-            mailbox.sent += self.arcs + len(self.pinned)
-            leader[self.pinned] = from_leader
-            return Heard(sent, self.held, leader, silence)
+            mailbox.sent += self.arcs + len(pinned)
+            pool = columns(N + 1, width)
+            pool[:N], pool[N] = sent, from_leader
+            return Heard(pool, self.held, pool[N:], pinned, self.no_silence)
+        silence = np.zeros((N, 2))
         message = np.concatenate(
             [sent[self.system.senders], np.tile(from_leader, (len(self.pinned), 1))]
         )
         if k == 0:
             mailbox.held = message
         received = mailbox.exchange(k, message, self.conditions.loss if self.always_draws else None)
-        leader[self.pinned] = received[self.arcs :]
         age = mailbox.age(k) * self.system.clock.period / TICKS_PER_SECOND
         np.maximum.at(silence[:, 0], self.receivers, age[: self.arcs])
-        silence[self.pinned, 1] = age[self.arcs :]
-        return Heard(received[: self.arcs], self.held, leader, silence)
+        silence[pinned, 1] = age[self.arcs :]
+        return Heard(received[: self.arcs], self.held, received[self.arcs :], pinned, silence)
 
     def _control(self, t: float, k: int, sent: Array, heard: Heard) -> None:
         """Let the controllers decide whose period begins; the others' inputs stay."""
-        system, state, all_act = self.system, self.state, self._all_act
+        system, state = self.system, self.state
         for period, of_period in self.periods:
-            mine = of_period if all_act else of_period & ~self.plant.frozen[: len(sent)]
-            if k % period or not mine.any():
+            mine = of_period if self.all_act else of_period & ~self.plant.frozen[: len(sent)]
+            if k % period or not (self.all_act or mine.any()):
                 continue
             h = period * system.clock.period / TICKS_PER_SECOND
             decision = system.law.step(
@@ -521,6 +520,10 @@ class Run:
                 gain = self.conditions.actuator_gain
                 follows = state.actuated + gain * (decision.u - state.actuated)
                 actuated = np.where(gain == 1.0, decision.u, follows)
+            if self.all_act:
+                state.u, state.applied, state.actuated = decision.u, decision.applied, actuated
+                state.pending = decision.memory
+                continue
             state.u = _merged(mine, decision.u, state.u)
             state.applied = _merged(mine, decision.applied, state.applied)
             state.pending = _merged(mine, decision.memory, state.pending)
@@ -576,17 +579,21 @@ class Run:
         self.ahead[:] = guessed
         for stage in system.stages:
             begins = ends = stage
-            if not self._all_act:
+            if not self.all_act:
                 alive = stage[~self.plant.frozen[stage]]
                 begins = alive[k % system.every[alive] == 0]
                 ends = alive[(k + 1) % system.every[alive] == 0]
             self._set_inputs(begins, latest)
             if not len(ends):
                 continue
-            t = (k + 1 - system.every[ends]) * clock.period / TICKS_PER_SECOND
-            self.plant.step(ends, t, self.lengths[ends], state.inputs, latest)
+            t = np.full(len(ends), clock.time(k))
+            if not self.in_step:
+                t = (k + 1 - system.every[ends]) * clock.period / TICKS_PER_SECOND
+            lengths = self.lengths if len(ends) == len(self.lengths) else self.lengths[ends]
+            self.plant.step(ends, t, lengths, state.inputs, latest)
             state.k = k + 1  # a reading that fails belongs to the next point
-            if not self._all_act:
+            self.all_act = self.in_step and not self.plant.frozen.any()
+            if not self.all_act:
                 ends = ends[~self.plant.frozen[ends]]  # some may have failed in this very step
             self.plant.read(ends, clock.time(k + 1), latest)
             state.k = k
@@ -619,7 +626,7 @@ class Run:
 
     def _remember(self, t: float, k: int) -> None:
         state, system = self.state, self.system
-        if self._all_act:
+        if self.all_act:
             state.memory = state.pending
         else:
             N = system.network.N
@@ -632,11 +639,9 @@ class Run:
     def _observe(self, t: float) -> None:
         """Record, and keep the figures of the outcome."""
         state, m = self.state, self.system.agent.m
-        x = None if self.x_of is None else self.x_of(state.readings)
-        xhat, s = state.memory[:, :m], state.leader[:m]
+        x, xhat, s = self.x, state.memory[:, :m], state.leader[:m]
         if self.record is not None:
-            y = self.y_of(state.readings)
-            row = {"xhat": xhat, "u": state.u, "sec_u": state.applied, "y": y, "s": s}
+            row = {"xhat": xhat, "u": state.u, "sec_u": state.applied, "y": self.y, "s": s}
             if x is not None:
                 row["x"] = x
             row["measured"] = state.measured
@@ -650,10 +655,9 @@ class Run:
             self.limit = DIVERGED * float(scale)
         lowest = reduce(np.minimum, truth.T)
         falls = lowest < self.min_state
-        if falls.any():
-            self.min_state = np.where(falls, lowest, self.min_state)
-            self.min_time = np.where(falls, t, self.min_time)
-        if not (_size(truth) <= self.limit and _size(xhat) <= self.limit):
+        np.copyto(self.min_state, lowest, where=falls)
+        np.copyto(self.min_time, t, where=falls)
+        if not (_is_within(truth, self.limit) and _is_within(xhat, self.limit)):
             self._diverged(t, np.maximum(_largest(truth), _largest(xhat)))
 
     def _diverged(self, t: float, size: Array) -> NoReturn:
@@ -677,9 +681,10 @@ def _largest(X: Array) -> Array:
     return np.asarray(reduce(np.maximum, np.abs(X).T))
 
 
-def _size(X: Array) -> float:
-    """Largest modulus; NaN or infinite where one of the numbers is."""
-    return max(float(X.max()), -float(X.min()))
+def _is_within(X: Array, limit: float) -> bool:
+    """Whether no modulus is beyond the limit; NaN is. The sum of squares, if small, says it."""
+    rows = X.T  # in one piece: read in order
+    return bool(np.vdot(rows, rows) <= limit * limit or np.abs(rows).max() <= limit)
 
 
 def _merged(chosen: Any, new: Array, old: Array) -> Array:
@@ -687,19 +692,18 @@ def _merged(chosen: Any, new: Array, old: Array) -> Array:
     return new if chosen.all() else np.where(chosen[:, None], new, old)
 
 
-def _taker(starts: Whole, first: int, count: int) -> Callable[[Array], Array]:
-    """Return a function that takes some values of each agent, (N, count), from those of all.
+def _taker(starts: Whole, count: int) -> Callable[[Array], Array]:
+    """Return a function that takes the first values of each agent, (count, N), from those of all.
 
-    Agents with equally many values are the rows of a matrix. What it gives has columns in one
-    piece: rows are many and short, so all that follows is done column by column.
+    Agents with equally many values are the rows of a matrix. What it gives has a column for each
+    agent: rows are few and long, and all that follows is done row by row.
     """
     widths = np.diff(starts)
     N, width = len(widths), int(widths[0])
     if (widths == width).all() and starts[0] == 0:
-        some = slice(first, first + count)
-        return lambda values: np.asfortranarray(values[: N * width].reshape(N, width)[:, some])
-    places = starts[:-1, None] + first + np.arange(count)
-    return lambda values: np.asfortranarray(values[places])
+        return lambda values: values[: N * width].reshape(N, width)[:, :count].T.copy()
+    places = starts[:-1] + np.arange(count)[:, None]
+    return lambda values: values[places]
 
 
 def diverged_reason(names: Sequence[str], size: Array, limit: float, t: float) -> tuple[str, str]:

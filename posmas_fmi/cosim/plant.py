@@ -44,12 +44,15 @@ class Plant(Interface):
         """What has failed so far."""
 
     def read(self, which: Whole, time: float, readings: Array) -> None:
-        """Write the readings of some instances, which stand at a time [s]."""
+        """Write the readings of some instances, which stand at a time [s].
+
+        At the start of all; then of those that have just been stepped.
+        """
 
     def step(self, which: Whole, t: Array, h: Array, inputs: Array, readings: Array) -> None:
         """Advance some instances from t over h [s], (n,) each, with their inputs held.
 
-        Instances elsewhere than in this process write their readings at once.
+        Readings may be written at once; what cannot be read is raised by `read`.
         """
 
     def save(self, which: Whole) -> Any:

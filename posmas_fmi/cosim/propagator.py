@@ -38,7 +38,7 @@ class Propagator:
 
     h: float
     H: Array
-    g: Callable[[float, Array], Array]
+    g: Callable[[float, Array, Array], None]  # g(t, X, out), a column per agent
     full: Array  # e^{Ah}
     half: Array  # e^{Ah/2}
     gamma: Array  # ∫₀ʰ e^{Aτ} dτ
@@ -55,7 +55,7 @@ class Propagator:
         return cls(
             h=h,
             H=agent.H,
-            g=agent.g_numpy,
+            g=agent.g_columns,
             full=phi0,
             half=half0,
             gamma=h * phi1,
@@ -82,17 +82,28 @@ class Propagator:
 
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""
-        # columns are agents here: products of a small matrix and a wide one are the fast ones
-        N, m = X.shape
-        known = np.empty((6 * m, N))  # x, w, then g of each stage
+        m = X.shape[1]
+        known = self.room(len(X))
         known[:m], known[m : 2 * m] = X.T, W.T
-        x, half = X.T, 0.5 * self.h
+        return self.advance(t, known).T
+
+    def room(self, N: int) -> Array:
+        """Room for what `advance` knows of N agents, a column each: x and w (to be set), then g."""
+        return np.empty((6 * len(self.H), N))
+
+    def advance(self, t: float, known: Array) -> Array:
+        """Return the states (m, N) at t + h, a column per agent; see `room`.
+
+        Products of a small matrix and a wide one are the fast ones.
+        """
+        m, half = len(self.H), 0.5 * self.h
+        x = known[:m]
         for k, (time, stage) in enumerate(
             zip((t, t + half, t + half, t + self.h), self.stages, strict=True), start=2
         ):
-            known[k * m : (k + 1) * m] = self.g(time, x.T).T
-            x = stage @ known[: (k + 1) * m]
-        return np.asarray(x.T)
+            self.g(time, x, known[k * m : (k + 1) * m])
+            x = np.dot(stage, known[: (k + 1) * m])
+        return x
 
 
 def _phi_functions(M: Array) -> tuple[Array, Array, Array, Array]:

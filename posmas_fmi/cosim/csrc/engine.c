@@ -504,6 +504,7 @@ FOR_EACH_AGENT int step(const Engine *e, const Member *me, const Point *p, int64
         ++*posted;
         return 1;
     }
+    fmus_expect(f, i + 1);
     if (!fmus_step(f, i, t, h, inputs, me->scratch, me->report)) {
         failed(e, p, i, me->report, signal);
         return !signal->failed; /* the rest of this point is recorded */

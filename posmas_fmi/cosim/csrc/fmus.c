@@ -205,7 +205,8 @@ static int goes_on(Incident *incidents, int64_t instance, Report *report)
     return 1;
 }
 
-/* Step the instances numbered `which`, each from its own time over its own step. */
+/* Step the instances numbered `which`, each from its own time over its own step, and read each
+ * where it then is. When one cannot be stepped, those after it are not; reading goes on. */
 EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const double *t,
                           const double *h, const double *inputs, double *readings,
                           double *scratch, Report *report, Incident *incidents)
@@ -216,9 +217,14 @@ EXPORT void fmus_step_all(const Fmus *f, const int64_t *which, int64_t n, const 
         if (fmus_is_remote(f, i)) {
             f->remote->post(f->remote->context, i, t[k], h[k], inputs + f->input_at[i]);
             posted++;
-        } else if (!fmus_step(f, i, t[k], h[k], inputs + f->input_at[i], scratch, report) &&
-                   !goes_on(incidents, i, report)) {
-            break;
+            continue;
+        }
+        fmus_expect(f, i + 1);
+        if (!fmus_step(f, i, t[k], h[k], inputs + f->input_at[i], scratch, report)) {
+            if (!goes_on(incidents, i, report))
+                break;
+        } else if (!fmus_read(f, i, readings + f->reading_at[i], scratch, report)) {
+            goes_on(incidents, i, report);
         }
     }
     if (!posted)

@@ -110,6 +110,17 @@ static inline int fmus_is_remote(const Fmus *f, int64_t instance)
     return f->remote && f->is_remote[instance];
 }
 
+/* Tell the processor which instance comes next: thousands of them do not fit into its caches, and
+ * what it fetches while another one steps it need not wait for. How large an instance is only the
+ * FMU knows; fetching what is not there does no harm. */
+static inline void fmus_expect(const Fmus *f, int64_t instance)
+{
+    enum { LINE = 64, LINES = 8 };
+    if (instance < f->n)
+        for (int line = 0; line < LINES; line++)
+            __builtin_prefetch((const char *)f->component[instance] + line * LINE);
+}
+
 /* Both return whether all went well; inputs and values are those of the ports, `scratch` has room
  * for an exchange. A remote instance is read only; its steps go through `remote`. */
 int fmus_step(const Fmus *fmus, int64_t instance, double t, double h, const double *inputs,
