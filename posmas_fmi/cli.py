@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -44,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"posmas-fmi: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
+        if argv is None:  # this process ends now, and another Ctrl-C adds nothing
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print("posmas-fmi: cancelled", file=sys.stderr)
         return CANCELLED
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`

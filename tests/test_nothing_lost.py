@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import h5py
@@ -134,6 +135,39 @@ def test_a_folder_is_for_one_run_at_a_time(tmp_path: Path) -> None:
         pass
     with occupied(tmp_path / "out"):
         pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("moment", "times"), [("manifest.json", 1), ("results.nc", 2)])
+def test_ctrl_c_ends_the_command_and_leaves_nothing_half_done(
+    tmp_path: Path, moment: str, times: int
+) -> None:
+    """While FMUs are loaded, and twice in a row while the run goes on."""
+    out, temporary = tmp_path / "out", tmp_path / "tmp"
+    temporary.mkdir()
+    command = ["-m", "posmas_fmi", "run", "paper_example_1", "--until", "2000", "--out", str(out)]
+    process = subprocess.Popen(
+        [sys.executable, *command],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    while process.poll() is None and not (out / moment).exists():
+        time.sleep(0.01)
+    for _ in range(times):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    _, said = process.communicate()
+    assert process.returncode in (130, -signal.SIGINT)  # Python's own way, 130 for a shell
+    assert "Traceback" not in said
+    assert not list(temporary.iterdir())
+    assert not list(out.glob("*.partial"))
+    if (out / "results.nc").exists():
+        with h5py.File(out / "results.nc") as file:
+            assert not file.attrs["complete"].any()
+            assert np.isfinite(file["x"][: written_rows(file["time"][:])]).all()
 
 
 def test_folders_of_the_dead_are_swept_and_those_of_the_living_stay(

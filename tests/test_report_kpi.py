@@ -116,11 +116,13 @@ def test_faults_and_incidents_are_shown(tmp_path):
         faults=[{"kind": "leader_lost", "agent": None, "from": 600.0, "until": 1200.0,
                  "detail": "no set-point", "covered": "D"}],
         incidents=[{"agent": "2", "time": 61.0, "call": "doStep", "verdict": "died",
-                    "action": "restarted"}],
+                    "fmu": "line.fmu", "inputs": {"u": 0.5, "q": None}, "action": "restarted",
+                    "detail": "3 steps done again"}],
     )  # fmt: skip
     text = plain(write_report(folder).read_text(encoding="utf-8"))
     assert "leader_lost – from 10 min to 20 min no set-point D" in text
-    assert "2 1 min 1 s doStep died restarted" in text
+    assert "2 1 min 1 s doStep of line.fmu died (inputs u = 0.5, q = not finite)" in text
+    assert "restarted: 3 steps done again" in text
 
 
 def test_a_controller_that_left_no_results_still_has_its_figures(folder, tmp_path):

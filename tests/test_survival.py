@@ -304,6 +304,8 @@ def test_the_command_tells_the_failure_in_all_its_files(
     assert VERDICTS[fault] in first["verdict"]
     assert "Faults and incidents" in page
     assert VERDICTS[fault] in page
+    assert f"u = {first['inputs']['u']:.6g}" in page
+    assert "faulty.fmu: the process" in page
     if action == "stop":
         assert VERDICTS[fault] in printed
     else:

@@ -95,13 +95,21 @@ class Fault:
 
 @attrs.frozen
 class Incident:
-    """An FMU that failed while the run went on."""
+    """An FMU that failed while the run went on.
+
+    `inputs` are those of the step that failed, as text; `said` is what the instance logged and its
+    process wrote last; `detail` is how the others went on.
+    """
 
     agent: str
     time: float | None
     call: str
     verdict: str
     action: str
+    fmu: str = ""
+    inputs: str = ""
+    said: str = ""
+    detail: str = ""
 
 
 @attrs.frozen

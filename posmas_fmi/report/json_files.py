@@ -238,9 +238,28 @@ def summary_facts(content: dict[str, Any], path: Path) -> Summary:
                 row.text("call", ""),
                 row.text("verdict", ""),
                 row.text("action", ""),
+                row.text("fmu", ""),
+                inputs_text(row.mapping("inputs")),
+                clean("\n".join((*row.texts("messages"), row.text("output", "")))).strip(),
+                row.text("detail", ""),
             )
             for row in keys.objects("incidents", required=False)
         ),
+    )
+
+
+def inputs_text(inputs: Mapping[str, Any]) -> str:
+    """Return the inputs of a step as text: ``u = 0.06, v = 1``.
+
+    Examples
+    --------
+    >>> inputs_text({"u": 0.0625, "v": None})
+    'u = 0.0625, v = not finite'
+    """
+    found = {name: number(value) for name, value in inputs.items()}
+    return ", ".join(
+        f"{clean(name)} = {'not finite' if value is None else f'{value:.6g}'}"
+        for name, value in found.items()
     )
 
 

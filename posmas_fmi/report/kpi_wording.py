@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from posmas_fmi.report.json_files import inputs_text
 from posmas_fmi.report.kpi_data import Controller, KpiRun, Limit, alike
 from posmas_fmi.report.kpi_figures import worst_line
 from posmas_fmi.report.wording import join, show
@@ -144,15 +145,17 @@ def fault(row: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
 
 
 def incident(row: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
-    """Return agent, time, call, verdict and action, as text."""
+    """Return agent, time, call, verdict with inputs, and action, as text."""
     time = row.get("time")
     moment = when(time) if isinstance(time, int | float) else "–"
+    inputs, fmu, detail = row.get("inputs"), row.get("fmu"), row.get("detail")
+    given = f" (inputs {inputs_text(inputs)})" if isinstance(inputs, dict) and inputs else ""
     return (
         _text(row, "agent"),
         moment,
-        _text(row, "call"),
-        _text(row, "verdict"),
-        _text(row, "action"),
+        _text(row, "call") + (f" of {fmu}" if fmu else ""),
+        _text(row, "verdict") + given,
+        _text(row, "action") + (f": {detail}" if detail else ""),
     )
 
 
