@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.design import DesignSettings, certify, design
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2
-from posmas_fmi.errors import DesignError, InputError, NetworkError
+from posmas_fmi.errors import AgentError, DesignError, InputError, NetworkError
 from posmas_fmi.network import network_from_arcs
 
 SETTINGS_1 = DesignSettings(phi=10.0)
@@ -161,7 +161,7 @@ def test_no_actuation_of_an_unstable_agent() -> None:
 def test_huge_entries_do_not_crash() -> None:
     agent = linear_agent([[-1e300]], [[1.0]], [[1.0]])
     network = network_from_arcs(1, [], [1])
-    with pytest.raises(DesignError, match=r"\$\.agent\.A\[0\]\[0\].*1e\+300"):
+    with pytest.raises(AgentError, match=r"\$\.agent\.A\[0\]\[0\].*1e\+300"):
         design(agent, network, DesignSettings(), 0.1)
     made = certify(agent, network, [[-1.0]], [[1.0]], DesignSettings(), 0.1)
     assert made.certificate.certified == "no"

@@ -59,6 +59,17 @@ def test_quadratic_design_is_certified_with_its_own_proofs() -> None:
     assert made.certificate.rate is not None
 
 
+def test_an_observer_is_slowed_until_it_keeps_signs_between_samples() -> None:
+    """One agent alone is fast: three times its rate is too much for a period of 5 ms."""
+    agent, alone = EXAMPLE_1.agent("tanh"), network_from_arcs(1, [], [1])
+    made = design(agent, alone, DesignSettings(method="lmi", phi=10.0), 0.005)
+    assert made.certificate.certified == "yes"
+    assert made.certificate.positive
+    asked = DesignSettings(method="lmi", phi=10.0, observer_rate=44.0)
+    kept = design(agent, alone, asked, 0.005).certificate
+    assert [c.name for c in kept.failing] == ["T: observer keeps signs for every tau <= h"]
+
+
 def test_pins_that_cannot_work_say_so() -> None:
     with pytest.raises(DesignError, match="another pinned agent"):
         design(

@@ -10,7 +10,7 @@ import numpy as np
 from posmas_fmi.agent import Agent
 from posmas_fmi.design.result import Baseline, Design
 from posmas_fmi.design.settings import METHODS, DesignSettings, Method
-from posmas_fmi.errors import DesignError, NotBuiltError
+from posmas_fmi.errors import AgentError, NotBuiltError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
@@ -54,8 +54,9 @@ def design(
     NetworkError
         If the leader does not reach every agent.
     DesignError
-        If the method finds no gains, saying what clashes, where, and what would help; or if a
-        matrix has an entry with which nothing can be computed.
+        If the method finds no gains, saying what clashes, where, and what would help.
+    AgentError
+        If a matrix has an entry with which nothing can be computed.
 
     Examples
     --------
@@ -87,7 +88,7 @@ def _check_sizes(agent: Agent, period: float | None) -> None:
         entries = np.abs(getattr(agent, name)) * (period or 1.0)
         if entries.max(initial=0.0) > LARGEST:
             i, j = (int(k) for k in np.unravel_index(entries.argmax(), entries.shape))
-            raise DesignError(
+            raise AgentError(
                 f"expected entries up to {LARGEST:g}, counted per control period (got "
                 f"{getattr(agent, name)[i, j]:g}): correct it, or take other units or a shorter "
                 "period",

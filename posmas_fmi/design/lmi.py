@@ -17,6 +17,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent, Assumption
 from posmas_fmi.certify.certificate import Certificate, Condition
+from posmas_fmi.certify.closed_loop import Prover
 from posmas_fmi.certify.loop import Loop
 from posmas_fmi.certify.proof import (
     Definiteness,
@@ -46,7 +47,7 @@ from posmas_fmi.network import Network
 
 _DENSE_AGENTS = 60  # beyond this the diagonal scaling is fixed and only one number is searched
 _BISECTIONS = 40
-_FACTORS = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of K, to leave room for sampling
+_FACTORS = (1.0, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5)  # of K or κ_e: room for sampling
 _OBSERVER_FACTOR = 3.0  # in a quadratic design fast observers cost much gain
 _SAFETY = 1e-5  # relative distance of proved scalars from their optima
 
@@ -344,8 +345,13 @@ def scaled_feedback(
     return prove_feedback(agent, phi, graph, K, V, theta, max(base.kappa, 0.0) + size)
 
 
-def observer_gain(agent: Agent, rate: float, digits: int) -> tuple[Array, float, Definiteness]:
+def observer_gain(
+    agent: Agent, rate: float, digits: int, spare: float = 0.0
+) -> tuple[Array, float, Definiteness]:
     """Local observer with least ``‖W‖`` for the rate κ_e; E, the proved rate, the proof.
+
+    Sign conditions are asked for with room for the rounding of E, and with that share of
+    ``A - |H|ℓ`` to spare: sampling needs some.
 
     Raises
     ------
@@ -366,7 +372,10 @@ def observer_gain(agent: Agent, rate: float, digits: int) -> tuple[Array, float,
         p >= 1,
         W @ C >= 0,
     ]
-    constraints += [room[i, j] >= 1e-6 for i in range(m) for j in range(m) if i != j]
+    kept = max(1e-6, 10.0 ** (1 - digits) * float(np.abs(A).max())) + spare * np.maximum(
+        A - agent.H_ell, 0.0
+    )
+    constraints += [room[i, j] >= kept[i, j] * p[i] for i in range(m) for j in range(m) if i != j]
     program = cp.Problem(cp.Minimize(cp.sum(cp.abs(W)) + 1e-6 * cp.sum(p)), constraints)
     if not solve(program, "observer") or W.value is None:
         raise DesignError(
@@ -484,10 +493,24 @@ def _observer(
         )
     wanted = settings.observer_rate or _OBSERVER_FACTOR * kappa
     E, rate, proof = observer_gain(agent, wanted, settings.digits)
+    for factor in _FACTORS if settings.observer_rate is None else ():
+        with suppress(DesignError):
+            slower = observer_gain(agent, factor * wanted, settings.digits, 1 - factor)
+            if slower[2].positive and _keeps_signs(agent, network, settings, period, slower[0]):
+                E, rate, proof = slower
+                break
     condition = Condition.from_margin(
         "L: observer contracts", proof.bound, f"kappa_e = {rate:.9g} 1/s: {proof}"
     )
     return Estimate(E, rate if proof.positive else None, condition)
+
+
+def _keeps_signs(
+    agent: Agent, network: Network, settings: DesignSettings, period: float | None, E: Array
+) -> bool:
+    """Whether certificate P, and T's part of it, are proved of a local observer."""
+    loop = loop_of(agent, network, np.zeros((agent.p, agent.m)), E, settings, period)
+    return Prover(loop, loop.estimator(loop.weights), loop.weights).positive
 
 
 def _with_route_l(
