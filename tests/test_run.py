@@ -288,16 +288,17 @@ def test_results_are_readable_while_they_are_written(tmp_path):
     network = network_from_arcs(1, [], [1])
     layout = Layout(("1",), ("x1",), ("u1",), ("y1",))
     recorder = Recorder(tmp_path / "r.nc", layout, network, ("u",), {})
-    for k in range(CHUNK + 3):
+    for k in range(2 * CHUNK + 3):  # the second chunk waits until the first one is written
         recorder.record(float(k), {"u": np.array([[k]])})
     copy = tmp_path / "copy.nc"
     copy.write_bytes((tmp_path / "r.nc").read_bytes())
     with h5py.File(copy) as file:
-        assert written_rows(file["time"][:]) == CHUNK
+        assert written_rows(file["time"][:]) >= CHUNK
         assert file["u"][CHUNK - 1, 0, 0] == CHUNK - 1
     recorder.close()
     with h5py.File(tmp_path / "r.nc") as file:
-        assert file["time"].shape == (CHUNK + 3,)
+        assert file["time"].shape == (2 * CHUNK + 3,)
+        assert (file["u"][:, 0, 0] == np.arange(2 * CHUNK + 3)).all()
         assert file.attrs["complete"] == 0
 
 
@@ -333,4 +334,7 @@ def test_the_recorder_writes_before_it_holds_much(tmp_path, monkeypatch):
         for k in range(25):
             one.record(float(k), {"x": np.full((100, 2), k)})
         with h5py.File(tmp_path / "r.nc", "r") as file:
-            assert recorder.written_rows(file["time"][:]) == 20
+            assert recorder.written_rows(file["time"][:]) in (10, 20)  # or 20 are being written
+        one.flush()
+        with h5py.File(tmp_path / "r.nc", "r") as file:
+            assert recorder.written_rows(file["time"][:]) == 25

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
@@ -111,7 +112,10 @@ class Recorder:
         self._blocks: dict[str, list[Array]] = {name: [] for name in ("time", *variables)}
         self._taken: dict[str, int] = dict.fromkeys(self._blocks, 0)  # rows, written or not
         self._written = dict(self._taken)
+        self._given = dict(self._taken)  # rows, written or being written
         self._held = 0  # bytes
+        self._thread = ThreadPoolExecutor(1, "posmas-fmi-results")
+        self._writing: Future[None] | None = None
         self._flushed = monotonic()
         self._full = False
         self._handle = -1
@@ -122,7 +126,7 @@ class Recorder:
             _check(path, tuple(self._blocks), keep)
             for name in self._blocks:
                 if name != "x_baseline":  # that run is made anew
-                    self._taken[name] = self._written[name] = keep
+                    self._taken[name] = self._written[name] = self._given[name] = keep
         first = max(CHUNK, FIRST // self._row_size)
         self._replace(max(min(first, expected) if expected else CHUNK, self.rows))
 
@@ -250,55 +254,77 @@ class Recorder:
         self.record_block(np.array([time]), rows)
 
     def record_block(self, times: Array, values: dict[str, Array]) -> None:
-        """Add rows: times (r,) and arrays (r, …), which are copied or written at once."""
+        """Add rows: times (r,) and arrays (r, …), which are copied."""
         self.add({"time": times, **values})
 
     def add(self, values: dict[str, Array]) -> None:
-        """Add rows (r, …) of these variables only, after the last row that they have."""
-        large = max(len(block) for block in values.values()) >= CHUNK
+        """Add rows (r, …) of these variables only, after the last row that they have.
+
+        Raises
+        ------
+        ResultsError
+            If there was no room for rows that were added before.
+        """
         for name, block in values.items():
-            self._blocks[name].append(block if large else np.array(block, dtype=float))
+            self._blocks[name].append(np.array(block, dtype=float))
             self._taken[name] += len(block)
             self._held += block.nbytes
-        rows = max(self._taken[name] - self._written[name] for name in values)
+        rows = max(self._taken[name] - self._given[name] for name in values)
         if rows >= CHUNK or self._held >= HELD or monotonic() - self._flushed > LATEST:
-            self.flush()
+            self._hand_over()
 
     def flush(self) -> None:
-        """Write what is held in memory, times last: a row with a time is there.
+        """Write what is held in memory, and wait for that.
 
         Raises
         ------
         ResultsError
             If there is no room for it; what was written before stays.
         """
+        self._hand_over()
+        self._wait()
+
+    def _hand_over(self) -> None:
+        """Have a thread write what is held, while the run goes on; one such job at a time."""
+        self._wait()
         self._flushed = monotonic()
         if self._full or not any(self._blocks.values()):
             return
-        if self.rows > self._rows:
-            self._grow()
+        blocks, self._blocks = self._blocks, {name: [] for name in self._blocks}
+        self._given, self._held = dict(self._taken), 0
+        self._writing = self._thread.submit(self._write, blocks, dict(self._taken))
+
+    def _wait(self) -> None:
+        if self._writing is not None:
+            job = self._writing
+            wait([job])
+            self._writing = None
+            job.result()
+
+    def _write(self, blocks_of: dict[str, list[Array]], taken: dict[str, int]) -> None:
+        """Write rows up to those taken, times last: a row with a time is there."""
+        if taken["time"] > self._rows:
+            self._grow(taken["time"])
         for name in (*self._variables, "time"):
-            blocks, begin = self._blocks[name], self._written[name]
+            blocks, begin = blocks_of[name], self._written[name]
             if not blocks:
                 continue
-            rows = np.concatenate(blocks, dtype=float)
+            rows = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
             size = rows.nbytes // max(1, len(rows))
             try:
                 _write(self._handle, rows, self._offsets[name] + begin * size)
             except OSError as error:
                 raise self._no_room(error) from None
-            blocks.clear()
-            self._written[name] = self._taken[name]
-        self._held = 0
+            self._written[name] = taken[name]
 
-    def _grow(self) -> None:
-        """Make room for what is held: for much more, or, where the disk is short, just for that."""
-        more = max(self.rows, 4 * self._rows)
+    def _grow(self, rows: int) -> None:
+        """Make room for so many: for much more, or, where the disk is short, just for those."""
+        more = max(rows, 4 * self._rows)
         try:
-            self._replace(max(self.rows, min(more, self._expected)) if self._expected else more)
+            self._replace(max(rows, min(more, self._expected)) if self._expected else more)
         except ResultsError:
             self._full = False
-            self._replace(self.rows)
+            self._replace(rows)
 
     @property
     def rows(self) -> int:
@@ -330,6 +356,7 @@ class Recorder:
                 with suppress(ResultsError):  # then it stays: its times are missing
                     self._replace(self.rows)
         finally:
+            self._thread.shutdown()
             self._let_go()
 
     def __enter__(self) -> Recorder:
