@@ -175,8 +175,10 @@ def _regress(arguments: argparse.Namespace) -> int:
     import attrs
 
     from posmas_fmi.fmu.compare import regress
+    from posmas_fmi.fmu.prints import prints_to_stderr
 
-    result = regress(arguments.fmu, arguments.reference)
+    with prints_to_stderr():
+        result = regress(arguments.fmu, arguments.reference)
     rows = [attrs.asdict(deviation) for deviation in result.deviations]
     if arguments.json:
         _print_json({"passed": result.passed, "variables": rows})
@@ -189,16 +191,18 @@ def _regress(arguments: argparse.Namespace) -> int:
 
 def _linearise(arguments: argparse.Namespace) -> int:
     from posmas_fmi.fmu.linearise import linearise
+    from posmas_fmi.fmu.prints import prints_to_stderr
 
-    made = linearise(
-        arguments.fmu,
-        arguments.inputs,
-        arguments.outputs,
-        arguments.at,
-        values=dict(arguments.set),
-        states=arguments.states or None,
-        step=arguments.step,
-    )
+    with prints_to_stderr():
+        made = linearise(
+            arguments.fmu,
+            arguments.inputs,
+            arguments.outputs,
+            arguments.at,
+            values=dict(arguments.set),
+            states=arguments.states or None,
+            step=arguments.step,
+        )
     if arguments.json:
         _print_json(made.to_dict())
     else:
@@ -209,19 +213,21 @@ def _linearise(arguments: argparse.Namespace) -> int:
 def _fit(arguments: argparse.Namespace) -> int:
     from posmas_fmi.fmu.agent_toml import report
     from posmas_fmi.fmu.fit import fit_agent
+    from posmas_fmi.fmu.prints import prints_to_stderr
 
-    made = fit_agent(
-        arguments.fmu,
-        arguments.inputs,
-        arguments.outputs,
-        dict(arguments.region) or None,
-        arguments.at,
-        g=arguments.g or None,
-        sec=arguments.sec or None,
-        values=dict(arguments.set),
-        states=arguments.states or None,
-        degree=arguments.degree,
-    )
+    with prints_to_stderr():
+        made = fit_agent(
+            arguments.fmu,
+            arguments.inputs,
+            arguments.outputs,
+            dict(arguments.region) or None,
+            arguments.at,
+            g=arguments.g or None,
+            sec=arguments.sec or None,
+            values=dict(arguments.set),
+            states=arguments.states or None,
+            degree=arguments.degree,
+        )
     if arguments.json:
         _print_json(made.to_dict())
     else:

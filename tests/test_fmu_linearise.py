@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -550,3 +552,49 @@ def test_events_are_handled_on_the_way_to_the_operating_point(cache: Path) -> No
         assert made.interface == "Model Exchange"
         assert made.x0 == pytest.approx([temperature], rel=1e-8)
         np.testing.assert_allclose(made.A, [[slope]], atol=1e-6)
+
+
+class _Lazy:
+    """Takes its outputs as up to date once derivatives were asked for, as OpenModelica 1.13."""
+
+    def __init__(self) -> None:
+        self.file, self.x, self.y, self.old = self, np.zeros(1), np.zeros(1), True
+
+    def ports(self, names: tuple[str, ...]) -> np.ndarray:
+        return np.array(names)
+
+    def set_time(self, t: float) -> None: ...
+
+    def set_states(self, x: np.ndarray) -> None:
+        self.x, self.old = np.array(x), True
+
+    def derivatives(self) -> np.ndarray:
+        self.old = False
+        return -self.x
+
+    def read(self, ports: np.ndarray) -> np.ndarray:
+        if self.old:
+            self.y, self.old = self.x, False
+        return self.y
+
+
+def test_outputs_are_read_before_the_derivatives() -> None:
+    from posmas_fmi.fmu.evaluation import ModelExchangeEquations, Signals
+
+    names = Signals((), ("y",), ("x",), ("der(x)",))
+    f = ModelExchangeEquations(_Lazy(), names)  # type: ignore[arg-type]
+    assert f(0.0, np.array([3.0]), np.zeros(0))[1] == [3.0]
+
+
+def test_what_an_fmu_prints_is_no_result(capfd: pytest.CaptureFixture[str]) -> None:
+    import ctypes
+
+    from posmas_fmi.fmu.prints import prints_to_stderr
+
+    with prints_to_stderr():
+        ctypes.CDLL(None).puts(b"banner")
+        os.write(1, b"more\n")
+    sys.stdout.write("result\n")
+    captured = capfd.readouterr()
+    assert captured.out == "result\n"
+    assert sorted(captured.err.split()) == ["banner", "more"]

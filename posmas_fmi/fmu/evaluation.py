@@ -269,7 +269,9 @@ class ModelExchangeEquations:
         instance.set_time(t)
         instance.set_states(x)
         _write(instance, self._inputs, u)
-        return instance.derivatives(), _read(instance, self._outputs)
+        # outputs first: FMUs of OpenModelica 1.13 take all else as up to date after derivatives
+        y = _read(instance, self._outputs)
+        return instance.derivatives(), y
 
 
 class InitialisationEquations:
