@@ -18,6 +18,7 @@ import pytest
 
 from posmas_fmi.cosim.recorder import Layout, Recorder, written_rows
 from posmas_fmi.errors import InputError, ResultsError
+from posmas_fmi.fmu.build import write
 from posmas_fmi.fmu.scratch import Scratch, sweep
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.scenario.folder import occupied
@@ -168,6 +169,15 @@ def test_ctrl_c_ends_the_command_and_leaves_nothing_half_done(
         with h5py.File(out / "results.nc") as file:
             assert not file.attrs["complete"].any()
             assert np.isfinite(file["x"][: written_rows(file["time"][:])]).all()
+
+
+def test_parts_of_builds_that_were_killed_are_removed_by_a_later_one(tmp_path: Path) -> None:
+    old, new = tmp_path / ".a.part", tmp_path / ".b.part"
+    for part in (old, new):
+        part.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    write(tmp_path / "x.so", b"all")
+    assert {path.name for path in tmp_path.iterdir()} == {".b.part", "x.so"}
 
 
 def test_folders_of_the_dead_are_swept_and_those_of_the_living_stay(

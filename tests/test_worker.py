@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -72,3 +74,11 @@ def test_only_files_that_were_built_here_count_as_such(fmu: Path, tmp_path: Path
     changed = tmp_path / "changed.fmu"
     changed.write_bytes(fmu.read_bytes()[:-1] + b"x")
     assert not built_here(changed)
+
+
+def test_a_worker_starts_without_what_only_its_master_needs() -> None:
+    """SymPy alone takes longer than all the rest."""
+    code = "import sys, posmas_fmi.cosim.worker.server; print(*sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "posmas_fmi.fmu.open" in out.stdout.split()
+    assert not {"sympy", "scipy", "fmpy", "h5py"} & set(out.stdout.split())

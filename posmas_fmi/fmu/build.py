@@ -8,9 +8,11 @@ import logging
 import os
 import sys
 import tempfile
+import time
 import tomllib
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from posmas_fmi import resources
@@ -119,6 +121,7 @@ def write(path: Path, data: bytes) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _forget_parts(path.parent)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
         try:
             with os.fdopen(handle, "wb") as file:
@@ -130,6 +133,14 @@ def write(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise BuildError(f"cannot write the FMU: {error}", str(path)) from error
+
+
+def _forget_parts(folder: Path) -> None:
+    """Remove what builds that were killed have left: nothing is written for an hour."""
+    for part in folder.glob(".*.part"):
+        with suppress(OSError):
+            if time.time() - part.stat().st_mtime > 3600:
+                part.unlink()
 
 
 def cache_folder() -> Path:

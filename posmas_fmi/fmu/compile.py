@@ -10,13 +10,13 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import attrs
 
 from posmas_fmi.errors import BuildError
+from posmas_fmi.fmu.scratch import Scratch
 
 _LOG = logging.getLogger(__name__)
 
@@ -182,7 +182,9 @@ def shared_library(
         If there is no compiler or it fails; the message holds what it said.
     """
     compiler = find_compiler(target)
-    with tempfile.TemporaryDirectory(prefix="posmas-fmi-build-") as folder:
+    scratch = Scratch("posmas-fmi-build-")
+    try:
+        folder = scratch.folder
         for file, text in files.items():
             Path(folder, file).write_text(text, encoding="utf-8", newline="\n")
         output = name + target.extension
@@ -199,3 +201,5 @@ def shared_library(
             said = (run.stderr or run.stdout).strip()[-2000:]
             raise BuildError(f"{shlex.join(command)} failed:\n{said}", name)
         return result.read_bytes()
+    finally:
+        scratch.cleanup()

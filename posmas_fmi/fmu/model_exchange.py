@@ -5,16 +5,18 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from posmas_fmi.expression import Array
 from posmas_fmi.fmu.events import EventInfo, settle, update_discrete_states
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import pointer
+
+if TYPE_CHECKING:
+    from posmas_fmi.expression import Array  # SymPy, which a worker does not need
 
 _MOST_EVENTS = 10_000  # on the way to one point in time
 _EVENT_WIDTH = 1e-12  # relative: how closely a state event is located

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from posmas_fmi.expression import Array
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
 from posmas_fmi.fmu.variables import Ports
+
+if TYPE_CHECKING:
+    from posmas_fmi.expression import Array  # SymPy, which a worker does not need
 
 RTOL = 1e-8  # of the integration, unless the run says another one
 
