@@ -40,6 +40,7 @@ def record(path: Path, blocks: int, told: Path | None = None, expected: int = 0)
             values = np.repeat(times, 2).reshape(-1, 2, 1)
             one.record_block(times, {"x": values, "u": values})
             if told:
+                one.flush()
                 told.write_bytes(one.rows.to_bytes(4, "little"))
         if told:
             one.finish()
