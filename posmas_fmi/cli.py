@@ -99,6 +99,9 @@ def _run(arguments: argparse.Namespace) -> int:
         if summary["reason"]:
             print(f"           {summary['reason']}")
         print(f"certified  {_certified(result.design)}")
+        uncovered = [one["what"] for one in summary["coverage"] if not one["covered"]]
+        if uncovered:
+            print(f"           that does not cover {', '.join(uncovered)}")
         print(f"error      {_number(summary['tracking_error_final'])} to the leader at the end")
         print(f"min state  {_number(summary['min_state'])}")
         print(f"report     {folder / 'report.html'}")

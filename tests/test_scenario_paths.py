@@ -119,3 +119,12 @@ def test_a_relative_path_holds_in_worker_processes(
     one_fmu(tmp_path, tank_fmu(tmp_path, 2), '"power"', '"temperature"', more)
     monkeypatch.chdir(tmp_path)
     assert run(load("one.toml"), Path("out"), report=False).summary["ended"] == "complete"
+
+
+def test_the_command_tells_what_the_proof_does_not_cover(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(MINE)
+    path = scenario(tmp_path, '[control]\npython = "mine.py:Mine"\n')
+    main(["run", path, "--until", "0.1", "--out", str(tmp_path / "out")])
+    assert "that does not cover controllers of one's own" in capsys.readouterr().out

@@ -91,6 +91,28 @@ def test_the_numpy_loop_records_from_there_on(fmu: Path) -> None:  # noqa: F811
     same_from(20, after, rows)
 
 
+def test_the_numpy_loop_keeps_them_too(fmu: Path) -> None:  # noqa: F811
+    kept: list[Snapshot] = []
+    _, rows = go(system(), fmu, engine.Snapshots(None, 20, kept.append), "numpy")
+    assert [snapshot.k for snapshot in kept] == [20, 40, 60]
+    _, after = go(system(), fmu, engine.Snapshots(kept[1]), "numpy")
+    same_from(40, after, rows)
+
+
+@pytest.mark.usefixtures("no_states")
+@pytest.mark.parametrize("which", ["c", "numpy"])
+def test_a_branch_that_is_done_again_has_the_same_past(fmu: Path, which: str) -> None:  # noqa: F811
+    kept: list[Snapshot] = []
+    _, rows = go(system(), fmu, engine.Snapshots(None, 20, kept.append), which)
+    later = system(leader_changes=((30, np.array([5.0])),))
+    _, after = go(later, fmu, engine.Snapshots(kept[0], branches=True), which)
+    np.testing.assert_array_equal(after["x"][:11], rows["x"][20:31])
+    assert np.abs(after["x"][-1] - rows["x"][-1]).max() > 0.1
+    earlier = system(leader_changes=((10, np.array([5.0])),))
+    with pytest.raises(InputError, match="its past is another one"):
+        go(earlier, fmu, engine.Snapshots(kept[0], branches=True), which)
+
+
 def test_a_branch_goes_on_otherwise(fmu: Path) -> None:  # noqa: F811
     """The same past, another leader from 30 on."""
     kept: list[Snapshot] = []

@@ -30,7 +30,7 @@ from posmas_fmi.cosim.master import (
     simulate,
 )
 from posmas_fmi.cosim.plant import Plant
-from posmas_fmi.cosim.snapshot import Snapshot, arrivals_state, set_arrivals
+from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, arrivals_state, set_arrivals
 from posmas_fmi.errors import BuildError, FmuEndedError, InputError
 from posmas_fmi.expression import Array
 
@@ -157,8 +157,8 @@ def run(
     variables : tuple of str
         What to record.
     snapshots : Snapshots, optional
-        Where to begin, and what to do with snapshots. The numpy loop has none: it does all again
-        from the start and records from the snapshot on.
+        Where to begin, and what to do with snapshots. The numpy loop does all again from the start
+        and records from the snapshot on.
 
     Returns
     -------
@@ -170,7 +170,11 @@ def run(
     if choice.engine == "numpy":
         begin = snapshots.start.k if snapshots is not None and snapshots.start else 0
         return simulate(
-            system, plant, _by_row(record, variables, system.clock.time(begin)), progress
+            system,
+            plant,
+            _by_row(record, variables, system.clock.time(begin)),
+            progress,
+            snapshots,
         )
     assert isinstance(plant, FmuPlant)
     assert choice.library is not None
@@ -180,26 +184,8 @@ def run(
         if snapshots.every:
             one.keep_snapshots(snapshots.every, snapshots.keep)
         if snapshots.start is not None:
-            one.start_from(snapshots.start)
+            one.start_from(snapshots)
     return one.run(record, progress)
-
-
-@attrs.frozen(eq=False)
-class Snapshots:
-    """Where a run begins, and what is done with its snapshots.
-
-    Attributes
-    ----------
-    start : Snapshot, optional
-    every : int
-        Communication steps between snapshots; 0: none.
-    keep : callable
-        Gets each of them.
-    """
-
-    start: Snapshot | None = None
-    every: int = 0
-    keep: Callable[[Snapshot], None] = lambda snapshot: None
 
 
 def unfit(system: System) -> str:
@@ -346,6 +332,7 @@ class Engine:
         self._conditions = system.timeline.at(0)
         self._incidents: Any = None
         self._start: Snapshot | None = None
+        self._snapshots = Snapshots()
         self._checkpoint: Callable[[Snapshot], None] | None = None
         self._checkpoint_every = 0
         self._largest_initial = 0.0
@@ -590,7 +577,7 @@ class Engine:
         """Hand over a snapshot after so many communication steps, again and again."""
         self._checkpoint_every, self._checkpoint = every, keep
 
-    def start_from(self, snapshot: Snapshot) -> None:
+    def start_from(self, snapshots: Snapshots) -> None:
         """Begin there instead of at the start; the plant must be as it is at the start.
 
         Raises
@@ -598,6 +585,8 @@ class Engine:
         InputError
             If the snapshot is of another system.
         """
+        snapshot = snapshots.start
+        assert snapshot is not None
         known = {name: self._keep[name] for name in STATE if name in self._keep}
         for name, array in snapshot.arrays.items():
             if name in known and known[name].shape != array.shape:
@@ -607,7 +596,7 @@ class Engine:
                 )
         if snapshot.fmus is not None and len(snapshot.fmus) != len(self._plant.fmus):
             raise InputError("the snapshot has another number of FMUs")
-        self._start = snapshot
+        self._start, self._snapshots = snapshot, snapshots
 
     def snapshot(self) -> Snapshot:
         """Return all state at the communication point that comes next."""
@@ -629,7 +618,7 @@ class Engine:
             self._begin()
             self._slices(None, None, stop=k)
             self._pending = False
-            self._compare(snapshot)
+            self._snapshots.compare(self._keep)
             return
         self._plant.deserialise(snapshot.fmus, self._system.clock.time(k))
         for name, array in snapshot.arrays.items():
@@ -643,13 +632,6 @@ class Engine:
         if self._arrivals is not None:
             set_arrivals(self._arrivals, counts["arrivals"])
         self._set_conditions(max(k - 1, 0))
-
-    def _compare(self, snapshot: Snapshot) -> None:
-        """Say by how much a run that was done again differs from what it was."""
-        pairs = [(self._keep[n], a) for n, a in snapshot.arrays.items() if n in self._keep]
-        worst = max((float(np.abs(a - b).max(initial=0.0)) for a, b in pairs), default=0.0)
-        if worst > 0:
-            log.warning("run again, the FMUs do not repeat themselves: up to %.2g apart", worst)
 
     def _slices(
         self, record: RecordBlock | None, progress: Progress | None, stop: int | None = None

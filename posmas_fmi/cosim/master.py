@@ -18,6 +18,7 @@ from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import Heard, Law, Weights, columns
 from posmas_fmi.cosim.plant import Plant
+from posmas_fmi.cosim.snapshot import Snapshot, Snapshots
 from posmas_fmi.cosim.wiring import Whole, Wiring
 from posmas_fmi.errors import FmuCallError, FmuEndedError
 from posmas_fmi.expression import Array
@@ -265,6 +266,7 @@ def simulate(
     plant: Plant,
     record: Record | None = None,
     progress: Progress | None = None,
+    snapshots: Snapshots | None = None,
 ) -> Outcome:
     """Run the sampled loop: at each communication point read, exchange, compute, then step.
 
@@ -281,6 +283,9 @@ def simulate(
         communication point.
     progress : callable, optional
         Gets the number of steps done and in all.
+    snapshots : Snapshots, optional
+        What to do with snapshots, and which one the run must come to: it begins at the start in
+        any case, for controllers of one's own cannot be saved.
 
     Returns
     -------
@@ -288,7 +293,7 @@ def simulate(
         Also where the run diverged, an FMU failed, or it was interrupted: what was recorded
         before stays.
     """
-    return Run(system, plant, record, progress).run()
+    return Run(system, plant, record, progress, snapshots or Snapshots()).run()
 
 
 class _Stop(Exception):  # noqa: N818  (ends the loop; no error)
@@ -301,13 +306,19 @@ class Run:
 
     Parameters
     ----------
-    system, plant, record, progress
+    system, plant, record, progress, snapshots
         As for `simulate`.
     """
 
     def __init__(
-        self, system: System, plant: Plant, record: Record | None, progress: Progress | None
+        self,
+        system: System,
+        plant: Plant,
+        record: Record | None,
+        progress: Progress | None,
+        snapshots: Snapshots,
     ) -> None:
+        self.snapshots = snapshots
         self.system, self.plant = system, plant
         self.record, self.progress = record, progress
         network, agent, law = system.network, system.agent, system.law
@@ -425,12 +436,32 @@ class Run:
             self._step(k)
             self._remember(t, k)
             state.k = k + 1
+            self._keep_snapshot()
             if not self.all_act:
                 begins = np.flatnonzero(((k + 1) % system.every == 0) & ~self.plant.frozen)
             self.plant.checkpoint()
             interrupt.check()
             if self.progress is not None:
                 self.progress(state.k, clock.steps)
+
+    def _keep_snapshot(self) -> None:
+        """Hand over a snapshot if it is time, and see that the run comes to that it begins with."""
+        k, snapshots, state = self.state.k, self.snapshots, self.state
+        start = snapshots.start
+        arrives = start is not None and k == start.k
+        due = snapshots.every and k % snapshots.every == 0 and (start is None or k > start.k)
+        if not (arrives or due):
+            return
+        arrays = {
+            "loop_memory": np.array(state.memory),
+            "loop_leader": np.array(state.leader),
+            "loop_readings": state.readings.copy(),
+            "loop_inputs": state.inputs.copy(),
+        }
+        if arrives:
+            snapshots.compare(arrays)
+        if due:
+            snapshots.keep(Snapshot(k, arrays, {}, None))
 
     def _change_conditions(self, k: int) -> None:
         system, state = self.system, self.state

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,9 @@ from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.writing import whole
+
+log = logging.getLogger(__name__)
+SAME_PAST = 1e-3  # relative: what FMUs that do not repeat themselves exactly may differ by
 
 
 @attrs.frozen(eq=False)
@@ -78,6 +83,60 @@ class Snapshot:
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"this is not a snapshot of a run: {error}", str(path)) from None
         return cls(facts["k"], arrays, facts["counts"], states if facts["serialised"] else None)
+
+
+@attrs.frozen(eq=False)
+class Snapshots:
+    """Where a run begins, and what is done with its snapshots.
+
+    Attributes
+    ----------
+    start : Snapshot, optional
+    every : int
+        Communication steps between snapshots; 0: none.
+    keep : callable
+        Gets each of them.
+    branches : bool
+        Whether the run is another one than that of the snapshot. Then what is done again to get
+        there must come to the same.
+    """
+
+    start: Snapshot | None = None
+    every: int = 0
+    keep: Callable[[Snapshot], None] = lambda snapshot: None
+    branches: bool = False
+
+    def compare(self, arrays: dict[str, Array]) -> None:
+        """See that a run that was done again up to the snapshot is what it was.
+
+        Parameters
+        ----------
+        arrays : dict of str to array
+            As they are now; those that the snapshot has are compared.
+
+        Raises
+        ------
+        InputError
+            If another run was to begin there, and its past is not the same.
+        """
+        assert self.start is not None
+        worst = max(
+            (
+                float((np.abs(arrays[name] - kept) / np.maximum(1.0, np.abs(kept))).max(initial=0))
+                for name, kept in self.start.arrays.items()
+                if name in arrays
+            ),
+            default=0.0,
+        )
+        if self.branches and not worst <= SAME_PAST:
+            raise InputError(
+                "these FMUs or controllers cannot give their state, so the run is done again up to "
+                f"the snapshot; with this scenario its past is another one (off by {worst:.2g}): "
+                "what is to be different must begin at the snapshot or later, as a fault, a jump "
+                "of the leader or a signal does"
+            )
+        if worst > 0:
+            log.warning("run again, the FMUs do not repeat themselves: up to %.2g apart", worst)
 
 
 def arrivals_state(arrivals: Arrivals) -> dict[str, Any]:

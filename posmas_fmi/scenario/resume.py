@@ -8,9 +8,8 @@ from typing import Any
 
 import attrs
 
-from posmas_fmi.cosim.engine import Snapshots
 from posmas_fmi.cosim.recorder import written_rows
-from posmas_fmi.cosim.snapshot import Snapshot, newest
+from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, newest
 from posmas_fmi.errors import InputError
 from posmas_fmi.scenario.build import Scenario
 
@@ -127,7 +126,7 @@ def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapsho
     def keep(snapshot: Snapshot) -> None:
         snapshot.save(place / f"{snapshot.k}.npz")
 
-    return Snapshots(beginning.snapshot, every, keep)
+    return Snapshots(beginning.snapshot, every, keep, branches=beginning.keep is None)
 
 
 def forget_snapshots(folder: Path, after: int = -1) -> None:
