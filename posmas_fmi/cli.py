@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from posmas_fmi.fmu.linearise import Linearisation
 
 DONE, NEGATIVE, CANCELLED = 0, 1, 130
+_SHOWN = 12  # agents in a list
 _SCENARIO = "a file, or the name of a shipped scenario"
 
 
@@ -279,6 +280,10 @@ def _show_design(made: Design, as_json: bool) -> int:
         print(f"rate          {_number(certificate.rate)} 1/s")
         print(f"observer      {_number(certificate.observer_rate)} 1/s")
         print(f"non-negative  {'proved' if certificate.positive else 'not proved'}")
+        free = made.baseline
+        word = "contracts" if free.contracts else "is not proved to contract"
+        print(f"with K = 0    the agent {word} (rate {_number(free.rate)} 1/s)")
+        _show_reach(made)
         for condition in certificate.conditions:
             mark = "holds" if condition.holds else "REFUTED" if condition.refuted else "not proved"
             print(f"  {mark:10}  {condition.name} (margin {_number(condition.margin)})")
@@ -286,9 +291,25 @@ def _show_design(made: Design, as_json: bool) -> int:
                 print(
                     f"              {'; '.join(filter(None, (condition.proof, condition.detail)))}"
                 )
+        for text in certificate.covers:
+            print(f"  covers: {text}")
         for note in made.notes:
             print(f"  note: {note}")
     return DONE if made.certificate.certified != "no" else NEGATIVE
+
+
+def _show_reach(made: Design) -> None:
+    """Region of attraction and guaranteed band, where they were asked for."""
+    region, band = made.certificate.region_of_attraction, made.certificate.band
+    if region is not None:
+        start, error = _number(region.radius), _number(region.radius_estimation)
+        print(f"saturation    attracted from |delta| <= {start} with exact estimates")
+        print(f"              (estimation errors: share of {error}; {region.detail})")
+    if band is not None:
+        names = made.network.names
+        worst = [f"{name}: {_number(max(row))}" for name, row in zip(names, band, strict=True)]
+        more = f", … of {len(worst)} agents" if len(worst) > _SHOWN else ""
+        print(f"deviation     at most {', '.join(worst[:_SHOWN])}{more}")
 
 
 def _show_comparison(summary: dict[str, Any]) -> None:

@@ -321,3 +321,14 @@ def test_check_of_what_is_not_there_is_bad_input(tmp_path, capsys, arguments):
     assert main(["check", *(str(path) if a == "TANK" else a for a in arguments)]) == 2
     said = capsys.readouterr().err
     assert "no such file" in said or "did you mean 'power'" in said
+
+
+def test_the_text_of_a_design_tells_baseline_band_and_region(tmp_path, capsys):
+    path = tmp_path / "asked.toml"
+    text = (resources.shipped("models") / "paper_example_1_tanh.toml").read_text(encoding="utf-8")
+    asked = "[design]\nsaturation = 2.0\ndisturbance = [0.05, 0.05]"
+    path.write_text(text.replace("[design]", asked, 1), encoding="utf-8")
+    assert main(["design", str(path)]) == 0
+    printed = capsys.readouterr().out
+    for words in ("with K = 0", "attracted from |delta| <= ", "at most 1: 0.", "covers: arbitrary"):
+        assert words in printed
