@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import numpy as np
 import pytest
@@ -91,6 +93,56 @@ def test_a_panic_of_the_solver_is_a_clear_error() -> None:
 
     with pytest.raises(DesignError, match="panicked"):
         solver.solve(Broken(), "feedback")
+
+
+def test_a_solver_that_fails_is_a_clear_error() -> None:
+    from posmas_fmi.design import solver
+
+    class Broken:
+        status = "solver_error"
+
+        def solve(self, **_: object) -> None:
+            raise solver.cvxpy().error.SolverError("numerical trouble")
+
+    with pytest.raises(DesignError, match=r"the solver failed \(numerical trouble"):
+        solver.solve(Broken(), "feedback")
+
+
+@pytest.mark.parametrize(
+    ("status", "usable"), [("optimal_inaccurate", True), ("infeasible", False)]
+)
+def test_a_status_only_says_whether_there_is_a_point_to_prove(status: str, usable: bool) -> None:
+    from posmas_fmi.design import solver
+
+    class Done:
+        def __init__(self) -> None:
+            self.status = status
+
+        def solve(self, **_: object) -> None: ...
+
+    assert solver.solve(Done(), "feedback") is usable
+
+
+def test_an_inaccurate_point_is_not_proved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever its status says: what it leads to is refused by the proof."""
+    from posmas_fmi.design import integral_gains
+
+    solve = integral_gains.solve
+
+    def inaccurate(problem: Any, what: str) -> bool:
+        usable = solve(problem, what)
+        for variable in problem.variables():
+            variable.value = variable.value * 0.5 ** (variable.size == 1)
+        return usable
+
+    one = network_from_arcs(1, [], [1])
+    graph = quadratic.symmetric_scalar(one, (1.0, 1.0))
+    tank = linear_agent([[-0.1]], [[1.0]], [[1.0]])
+    assert graph is not None
+    assert integral_gains.integral_design(tank, graph, np.eye(1), 0.05).proof.positive
+    monkeypatch.setattr(integral_gains, "solve", inaccurate)
+    with pytest.raises(DesignError, match="could not be proved after rounding"):
+        integral_gains.integral_design(tank, graph, np.eye(1), 0.05)
 
 
 def test_a_solver_that_does_not_finish_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
