@@ -308,6 +308,15 @@ def test_a_line_without_leakage_has_an_agent() -> None:
     assert not agent.H_ell.any()
 
 
+def test_the_agent_of_an_integral_design_leaks_as_at_its_load() -> None:
+    agent = line_agent(LINE, integral=True)
+    rate = agent.derivative(0.0, LINE.theta0[None, :], np.zeros((1, 1)))
+    np.testing.assert_allclose(rate, 0.0, atol=1e-14)
+    np.testing.assert_array_equal(agent.A, LINE.A(LINE.kappa0, LINE.P0))
+    assert not agent.H_ell.any()
+    assert agent.slope == AGENT.slope
+
+
 # ---- values for the FMUs ------------------------------------------------------------------------
 
 

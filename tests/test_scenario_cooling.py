@@ -16,11 +16,12 @@ from posmas_fmi import cli, load, run
 from posmas_fmi.cooling import Loads, controller
 from posmas_fmi.cooling.row import Row, simulate_row
 from posmas_fmi.cosim import engine
+from posmas_fmi.design.integral_certificate import slope_assumption
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.scenario.build import shipped_scenarios
 from posmas_fmi.scenario.compare import controllers
-from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law, proved
+from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law, proved, with_slope
 from posmas_fmi.scenario.job import (
     extras,
     law_network,
@@ -29,7 +30,7 @@ from posmas_fmi.scenario.job import (
     run_designed,
 )
 from posmas_fmi.scenario.plant import fmu_files, make_instances
-from posmas_fmi.scenario.tables import CompareTable, ControlTable
+from posmas_fmi.scenario.tables import AgentTable, CompareTable, ControlTable
 
 pytestmark = pytest.mark.slow
 
@@ -226,7 +227,7 @@ SHIPPED = [path.stem for path in shipped_scenarios() if path.stem.startswith("co
 
 
 def test_the_shipped_rows_are_there() -> None:
-    assert len(SHIPPED) == 10
+    assert len(SHIPPED) == 11
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -244,3 +245,40 @@ def test_a_shipped_row_runs(name, designed) -> None:
             outcome = engine.run(make_system(one, made, instances), plant)
         assert outcome.ended == "complete"
         assert outcome.messages > 0
+
+
+@pytest.mark.parametrize("delay", [0.0, 5.0])
+def test_a_row_with_a_proved_integral_says_so_and_what_is_beyond_it(delay, tmp_path) -> None:
+    """Design, run and report: no offset where the loads differ, and certificate I about that."""
+    scenario = load("cooling_integral", until=1800.0)
+    scenario = attrs.evolve(scenario, channel=attrs.evolve(scenario.channel, delay=delay))
+    result = run(scenario, tmp_path)
+    facts = json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
+    assert facts["certified"] == "yes"
+    assert facts["rate"] > 0
+    assert {a["name"]: a["status"] for a in facts["assumptions"]}["slope"] == "verified"
+    assert "I: sampled loop contracts" in [c["name"] for c in facts["conditions"]]
+    assert result.summary["verdict"] == "converged"
+    assert result.summary["tracking_error_final"] < 0.05
+    rows = {row["what"]: row for row in result.summary["coverage"]}
+    assert ("delay of messages" in rows) == (delay > 0)
+    assert not any(row["covered"] for row in rows.values())
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "no offset" in page
+    assert ("the loop without delay" in page) == (delay > 0)
+    # the same row under the proportional law keeps one
+    droops = run(
+        attrs.evolve(scenario, control=ControlTable("proportional")), tmp_path / "p", report=False
+    )
+    assert droops.summary["tracking_error_final"] > 0.2
+
+
+def test_other_gains_or_another_line_have_no_proof_of_the_slope() -> None:
+    scenario = load("cooling_integral")
+    assert scenario.agent.slope is not None
+    narrow = attrs.evolve(scenario.agent, sector=(0.3, scenario.agent.m_h))
+    assert slope_assumption(narrow).status != "verified"
+    own = AgentTable(A=[[-1.0]], B=[[1.0]], C=[[1.0]])
+    assert scenario.cooling is not None
+    bare = attrs.evolve(scenario.agent, slope=None)
+    assert with_slope(bare, own, scenario.cooling) is bare

@@ -156,9 +156,9 @@ WHAT_IS_PROVED = {
     "printed": "The paper's sign: no certificate holds (erratum 1).",
     "proportional": "Certificates P, C, T of the design: positive and contracting, also sampled, "
     "for every load in the stated range; D: for every bounded delay. It leaves an offset.",
-    "integral": "Certificate I where [design] asks for it: the continuous loop contracts and has "
-    "no offset. Not proved: sampling, delays, limits of the valve, the fallback. Positivity by "
-    "physics.",
+    "integral": 'With [design] method = "integral" certificate I: the sampled loop of equal lines '
+    "contracts, for every slope of the valve in the stated range of loads, and has no offset. Not "
+    "proved: delays, losses, limits of the valve, the fallback. Positivity by physics.",
     "integral_ff": "As integral, for the loop about what is fed forward: the IT power does not "
     "depend on the valves. The facility water does, slowly; that path is not covered.",
     "set_point": "The consensus on the set-point converges (pinned Laplacian, step below one over "

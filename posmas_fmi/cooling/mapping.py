@@ -206,6 +206,7 @@ def line_agent(
     loads: tuple[float, float] = LOADS,
     theta_r: tuple[float, float] | None = None,
     opening: tuple[float, float] = (0.0, 1.0),
+    integral: bool = False,
 ) -> Agent:
     """Return the line as an agent of model (1), for design and certificates.
 
@@ -225,6 +226,9 @@ def line_agent(
         Range of the return temperature [K]; default `return_range` of the loads.
     opening : (float, float)
         Range of the valve position.
+    integral : bool
+        For a design with integral action: the leakage is that of P0, in A. What another load
+        leaks more is then part of the load.
 
     Returns
     -------
@@ -243,30 +247,34 @@ def line_agent(
     own_low, own_high = sector(line, (line.theta_r0, line.theta_r0), opening)
     with_own = min(theta_r[0], line.theta_r0), max(theta_r[1], line.theta_r0)
     valve = valve_mapping(line, opening)
-    g, sec = line_texts(line, opening)
+    g, sec = line_texts(line, opening, integral)
     # H carries kl P0/Cp, so that g has slope P/P0 in θp; P0/kl - θp0 is the load without leakage
-    weight = line.kl * line.P0 / line.Cp
+    leaks = line.kl > 0 and not integral
     return Agent(
-        A=line.A(line.kappa0),
-        H=np.diag([weight if line.kl > 0 else line.P0 / line.Cp, 0.0, 0.0]),
+        A=line.A(line.kappa0, line.P0 if integral else 0.0),
+        H=np.diag([(line.kl if leaks else 1.0) * line.P0 / line.Cp, 0.0, 0.0]),
         B=[[0.0], [0.0], [1 / line.Cs]],
         C=[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         g=VectorFunction.parse([g, "0", "0"], ["t", "x1", "x2", "x3"]),
         sec=VectorFunction.parse([sec], ["u1"]),
         sector=(min(low, own_low), max(high, own_high)),
-        lipschitz=[max(1.0, loads[1] / line.P0), 0.0, 0.0] if line.kl > 0 else None,
+        lipschitz=[max(1.0, loads[1] / line.P0), 0.0, 0.0] if leaks else None,
         region={"u1": valve.inputs},
         slope=slope_sector(line, with_own, opening),
     )
 
 
-def line_texts(line: LineParameters, opening: tuple[float, float] = (0.0, 1.0)) -> tuple[str, str]:
+def line_texts(
+    line: LineParameters, opening: tuple[float, float] = (0.0, 1.0), integral: bool = False
+) -> tuple[str, str]:
     """Return g₁ and sec of `line_agent` as text, in the language of expressions."""
     valve = valve_mapping(line, opening)
     position = f"clip({valve.y0!r} - {valve.gain!r}*u1, {opening[0]!r}, {opening[1]!r})"
     nominal = _kappa_text(line, repr(valve.y0))  # as text, so that sec(0) = 0 exactly
     sec = f"({nominal} - {_kappa_text(line, position)})*{line.theta_r0!r}"
-    return (f"x1 + {1 / line.kl - line.theta_p0!r}" if line.kl > 0 else "1"), sec
+    if integral or line.kl == 0:
+        return repr(1 - line.kl * line.theta_p0), sec
+    return f"x1 + {1 / line.kl - line.theta_p0!r}", sec
 
 
 def _kappa_text(line: LineParameters, y: str) -> str:

@@ -206,6 +206,10 @@ class _Builder:
         self.check_paths()
         clock = self.attempt(lambda: Clock.of(tables.scenario.until, tables.scenario.period))
         agent = self.attempt(lambda: make_agent(tables.agent))
+        if agent is not None and tables.cooling is not None:
+            from posmas_fmi.scenario.cooling import with_slope
+
+            agent = with_slope(agent, tables.agent, tables.cooling)
         network = self.attempt(lambda: make_network(tables.network, self.path.parent))
         design = self.attempt(lambda: make_design(tables.design))
         if tables.plant.fmi not in (2, 3):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import attrs
 import numpy as np
 
+from posmas_fmi.agent import Agent
 from posmas_fmi.cooling.classes import class_limit, dew_point
 from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, Control, controller, mean_delays
 from posmas_fmi.cooling.figures import facts, kpi_table, limits, verdicts
@@ -27,6 +28,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 from posmas_fmi.scenario.signals import read_signal
 from posmas_fmi.scenario.tables import (
+    AgentTable,
     ControlTable,
     CoolingTable,
     NetworkTable,
@@ -55,6 +57,11 @@ TOLERANCE = 1e-6  # of the solver in the FMUs: some 1e-5 K, a thousandth of the 
 # Integral time [s] of the integral law over its proportional part.
 INTEGRAL_TIME = mean_delays(NOMINAL)[1]
 
+LEAKAGE_NOTE = (
+    "The leakage in model (1) is that of the nominal load; what another load leaks more or less "
+    "counts as load."
+)
+
 
 def sizes(table: CoolingTable, lines: int) -> Array:
     """Return the nominal load of each line over that of the nominal line, (N,).
@@ -79,6 +86,7 @@ def expand(
     scenario: ScenarioTable,
     signals: Mapping[str, SignalTable],
     folder: Path,
+    integral: bool = False,
 ) -> dict[str, Any]:
     """Return the tables that ``[cooling]`` stands for, as TOML would give them.
 
@@ -94,6 +102,8 @@ def expand(
         With the load.
     folder : Path
         Of the scenario.
+    integral : bool
+        Whether the design is one with integral action.
 
     Raises
     ------
@@ -123,7 +133,7 @@ def expand(
     named = wet_bulb if isinstance(wet_bulb, str) else "wet_bulb"
     return {
         "scenario": {"tolerance": cooling.band},
-        "agent": _agent(cooling, line),
+        "agent": _agent(cooling, line, integral),
         "plant": {
             **_ports(cooling, line),
             "parameters": common,
@@ -169,17 +179,25 @@ def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
             )
 
 
-def _agent(cooling: CoolingTable, line: LineParameters) -> dict[str, Any]:
-    agent = line_agent(line, cooling.loads)
-    g, sec = line_texts(line)
+def _agent(cooling: CoolingTable, line: LineParameters, integral: bool) -> dict[str, Any]:
+    agent = line_agent(line, cooling.loads, integral=integral)
+    g, sec = line_texts(line, integral=integral)
+    bound = agent.lipschitz
     return {
         **{name: getattr(agent, name).tolist() for name in "ABCH"},
         "g": [g, "0", "0"],
         "sec": [sec],
         "sector": list(agent.sector),
-        "lipschitz": np.asarray(agent.lipschitz).tolist(),
+        **({} if bound is None else {"lipschitz": np.asarray(bound).tolist()}),
         "region": {name: list(limits) for name, limits in agent.region.items()},
     }
+
+
+def with_slope(agent: Agent, table: AgentTable, cooling: CoolingTable) -> Agent:
+    """Add the proved bounds of the slope of sec over the range of loads, if that is the line's."""
+    if table.sec != [line_texts(NOMINAL)[1]]:
+        return agent
+    return attrs.evolve(agent, slope=line_agent(NOMINAL, cooling.loads).slope)
 
 
 def _ports(cooling: CoolingTable, line: LineParameters) -> dict[str, Any]:
@@ -338,10 +356,9 @@ def proved(table: ControlTable, designed: Design) -> dict[str, Any]:
     no certificate.
     """
     note = WHAT_IS_PROVED.get(table.law, "")
-    certified = ("integral", "integral_ff") if designed.K_q is not None else ("proportional",)
-    own = {"K", "E", "K_q"} & set(table.parameters)
-    if table.law == "protocol" or (table.law in certified and not own):
-        return {"notes": [note]} if note else {}
+    if is_certified(table, designed):
+        leakage = [LEAKAGE_NOTE] if designed.K_q is not None else []
+        return {"notes": [note, *leakage]} if note else {}
     return {
         "certified": "no",
         "conditions": [],
@@ -352,6 +369,13 @@ def proved(table: ControlTable, designed: Design) -> dict[str, Any]:
         "positive": False,
         "notes": [f"The certificate of the design is not about this law, {table.law!r}. {note}"],
     }
+
+
+def is_certified(table: ControlTable, designed: Design) -> bool:
+    """Whether the certificate of the design is about the law, with the gains that it runs."""
+    certified = ("integral", "integral_ff") if designed.K_q is not None else ("proportional",)
+    own = {"K", "E", "K_q"} & set(table.parameters)
+    return table.law == "protocol" or (table.law in certified and not own)
 
 
 def _predictive(
@@ -428,9 +452,9 @@ def judge(
     # what is centralised: a line's readings to the centre and a command back
     messages = 2 * designed.network.N * outcome.steps if name == PREDICTIVE else outcome.messages
     alone = name in CONTROLLERS and CONTROLLERS[name].law in ("fixed", "local")
-    if name not in ("protocol", "proportional"):
+    if not is_certified(scenario.control, designed):
         for row in summary.get("coverage", []):
-            row |= {"covered": False, "why": "the certificate is about the protocol (6)"}
+            row |= {"covered": False, "why": "the certificate is not about this law"}
     figures = key_figures(
         table["time"],
         table["supply_temperature"],

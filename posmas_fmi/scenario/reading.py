@@ -104,10 +104,14 @@ def _expand(document: dict[str, Any], converter: cattrs.Converter, path: Path) -
     if problems:
         raise ScenarioError(tuple(problems), str(path))
     try:
-        more = expand(**parts, folder=path.parent)
+        more = expand(**parts, folder=path.parent, integral=_integral(document.get("design")))
     except PosmasError as error:
         raise ScenarioError(tuple(error.problems), str(path)) from None
     return merged(more, document)
+
+
+def _integral(design: Any) -> bool:
+    return isinstance(design, dict) and (design.get("method") == "integral" or "K_q" in design)
 
 
 def merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
