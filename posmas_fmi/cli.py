@@ -69,9 +69,9 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.outside,
     )
     if arguments.schedule:
-        from posmas_fmi.scenario.schedule import schedule_of
+        from posmas_fmi.scenario.job import scheduled
 
-        schedule = schedule_of(scenario)
+        schedule = scheduled(scenario)
         if arguments.json:
             _print_json(schedule.to_dict())
         else:

@@ -31,7 +31,7 @@ def test_all_at_once(folder: Path) -> None:  # noqa: F811
     heat = edges["3.primary_heat_flow", "facility.heat"]
     assert (kv.delay, kv.feedthrough) == (1, False)
     assert (heat.delay, heat.feedthrough) == (1, True)  # it depends on the header at once
-    assert edges["signal 0", "1.heat_load"].delay == 0
+    assert edges["signal load[1]", "1.heat_load"].delay == 0
     assert schedule.loops == (ALL,)
 
 
@@ -79,3 +79,10 @@ def test_the_command_prints_it(
     assert main(["run", path, "--schedule", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["period"] == 5.0
     assert not Path("out").exists() or not (Path("out") / "row").exists()
+
+
+@pytest.mark.parametrize("name", ["cooling_row", "paper_example_2"])
+def test_shipped_scenarios_have_one(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", name, "--schedule"]) == 0
+    text = capsys.readouterr().out
+    assert ("signal load[1] -> " in text) == (name == "cooling_row")

@@ -35,7 +35,7 @@ from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
 from posmas_fmi.scenario.resume import Beginning, branched, forget_snapshots, resumed, snapshots
-from posmas_fmi.scenario.schedule import make_schedule
+from posmas_fmi.scenario.schedule import Schedule, make_schedule, schedule_of
 from posmas_fmi.scenario.verdict import summarise
 from posmas_fmi.writing import whole
 
@@ -396,6 +396,22 @@ def extras(scenario: Scenario) -> tuple[str, ...]:
     from posmas_fmi.cooling.control import EXTRAS
 
     return EXTRAS
+
+
+def scheduled(scenario: Scenario) -> Schedule:
+    """Return what a run of a scenario will do; of a comparison, that with its first controller.
+
+    Raises
+    ------
+    PosmasError
+        As `posmas_fmi.scenario.schedule.schedule_of`.
+    """
+    if scenario.compare is not None:
+        from posmas_fmi.scenario.compare import controllers
+
+        control = next(iter(controllers(scenario).values()))
+        scenario = attrs.evolve(scenario, compare=None, control=control)
+    return schedule_of(scenario, extras(scenario))
 
 
 def law_network(scenario: Scenario, designed: Design) -> Network:

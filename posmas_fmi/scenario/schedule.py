@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import attrs
@@ -12,6 +13,7 @@ from posmas_fmi.errors import InputError
 from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
+from posmas_fmi.scenario.signals import Columns
 
 MANY = 6  # names that are printed of a long list
 EDGES = 200  # edges
@@ -42,7 +44,7 @@ class Edge:
     Attributes
     ----------
     source : str
-        ``instance.variable``, ``signal`` or ``controller``.
+        ``instance.variable``, ``signal NAME`` or ``controller``.
     target : str
         ``instance.variable``.
     delay : int
@@ -112,8 +114,14 @@ class Schedule:
         return "\n".join(lines)
 
 
-def schedule_of(scenario: Scenario) -> Schedule:
+def schedule_of(scenario: Scenario, measured: tuple[str, ...] = ()) -> Schedule:
     """Return the schedule of a scenario without running it.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    measured : tuple of str
+        What the law measures beside y.
 
     Raises
     ------
@@ -123,7 +131,7 @@ def schedule_of(scenario: Scenario) -> Schedule:
     files = fmu_files(scenario)
     abouts = {path: read_about(path) for path in dict.fromkeys(files)}
     return make_schedule(
-        scenario, make_instances(scenario, files), [abouts[path] for path in files]
+        scenario, make_instances(scenario, files, measured), [abouts[path] for path in files]
     )
 
 
@@ -167,7 +175,7 @@ def make_schedule(scenario: Scenario, instances: Instances, abouts: list[About])
     return Schedule(
         scenario.clock.h,
         tuple(actions),
-        tuple(_edges(instances, abouts, late, coupling)),
+        tuple(_edges(instances, abouts, late, coupling, scenario.signal_columns)),
         _loops(instances),
         {name: int(n) for name, n in zip(names, instances.every, strict=True) if n > 1},
     )
@@ -190,7 +198,7 @@ def _owner(instances: Instances) -> tuple[Any, list[PlantSpec]]:
 
 @attrs.frozen
 class _Feed:
-    """One term of an input; the source -1 is a signal."""
+    """One term of an input; where the source is -1, the variable is the column of a signal."""
 
     source: int
     variable: str
@@ -208,7 +216,7 @@ def _feeds(instances: Instances) -> list[_Feed]:
         first = len(inputs) - len(extras)
         for k, extra in enumerate(extras):
             for term in extra.terms:
-                source, variable = -1, f"signal {-1 - term.source}"
+                source, variable = -1, str(-1 - term.source)
                 if term.source >= 0:
                     source = int(np.searchsorted(at, term.source, side="right")) - 1
                     variable = specs[source].readings.variables[term.source - int(at[source])]
@@ -217,14 +225,23 @@ def _feeds(instances: Instances) -> list[_Feed]:
 
 
 def _edges(
-    instances: Instances, abouts: list[About], late: dict[str, int], coupling: str
+    instances: Instances,
+    abouts: list[About],
+    late: dict[str, int],
+    coupling: str,
+    columns: Mapping[str, Columns],
 ) -> list[Edge]:
     edges = []
+    signals = {
+        str(found.first + k): name if found.count == 1 else f"{name}[{k + 1}]"
+        for name, found in columns.items()
+        for k in range(found.count)
+    }
     names = [spec.name for spec in instances.specs]
     for feed in _feeds(instances):
         end = f"{names[feed.target]}.{feed.to}"
         if feed.source < 0:
-            edges.append(Edge(feed.variable, end, 0, False, feed.ramp))
+            edges.append(Edge(f"signal {signals[feed.variable]}", end, 0, False, feed.ramp))
             continue
         earlier = late.get(names[feed.source], 0) < late.get(names[feed.target], 0)
         known_at_end = earlier or coupling == "iterate"
