@@ -65,3 +65,14 @@ def test_in_a_scenario(valve: Path, tmp_path: Path, engine: str) -> None:
         u, y = data["u"].values, data["y"].values
     assert np.ptp(u) > 0.1
     np.testing.assert_array_equal(y[1:], np.rint(10.0 * u[:-1]))
+
+
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_what_went_wrong_is_told_from_any_process(
+    valve: Path, tmp_path: Path, isolation: str
+) -> None:
+    stage, more = '{variable = "stage", scale = 1e12}', f'isolation = "{isolation}"'
+    path = one_fmu(tmp_path, valve, stage, '"seen_stage"', more, gain=-0.37)
+    made = run(load(path), tmp_path / "out", report=False)
+    assert made.summary["verdict"] == "failed"
+    assert "expected values of type Integer from -2147483648" in made.summary["reason"]

@@ -219,6 +219,12 @@ class NativeMessages:
         sender = self._senders.setdefault(key, _Sender(self.address, key))
         return ctypes.addressof(sender)
 
+    def add(self, key: int, text: str) -> None:
+        """Keep what was found out about an instance, as if it had said it."""
+        write = self._library.message_log_fmi3
+        write.argtypes, write.restype = [_pointer, ctypes.c_int, *(ctypes.c_char_p,) * 2], None
+        write(self.environment(key), 3, b"error", text.encode())
+
     def forget(self, key: int) -> None:
         """Leave out what the instance has said so far."""
         self._begin[key] = self._log.written
@@ -298,7 +304,7 @@ class Fmus:
         self._interrupt = Interrupt()
         self.failures: list[Failure] = []
         self._keep: list[Any] = []  # what the structures point to
-        self._served = Served()
+        self._served = Served(None if messages is None else messages.add)
         kinds = list(zip((i.file for i in instances), inputs, readings, strict=True))
         number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
         bindings = (_Binding * len(number))(*(self._bind(*kind) for kind in number))

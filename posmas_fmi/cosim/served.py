@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from posmas_fmi.errors import FmuEndedError
+from posmas_fmi.errors import FmuEndedError, FmuError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import Ports
@@ -36,13 +36,18 @@ def needs_python(file: FmuFile, *ports: Ports) -> bool:
 class Served:
     """The three functions, and the instances and ports that they serve.
 
+    Parameters
+    ----------
+    tell : callable, optional
+        Gets the key of an instance and what its call raised: another process sees no errors.
+
     Attributes
     ----------
     get, set, do_step, set_rates : int
         Addresses of the functions.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tell: Callable[[int, str], None] | None = None) -> None:
         self._instances: dict[int, FmuInstance] = {}
         self._ports: list[Ports] = []
         self._failures: dict[int, BaseException] = {}
@@ -53,6 +58,8 @@ class Served:
                 call(instances[key or 0])
             except BaseException as error:  # nothing can be raised through C
                 failures[key or 0] = error
+                if tell is not None and isinstance(error, FmuError):
+                    tell(key or 0, error.message)
                 return _ERROR
             return _OK
 
