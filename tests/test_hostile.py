@@ -25,6 +25,7 @@ pytestmark = [
     pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory limits need /proc"),
 ]
 GOOD = ("good 2", "good 3")
+AT_ONCE = 4
 
 
 @pytest.fixture(scope="module")
@@ -34,25 +35,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def checked(folder: Path) -> dict[str, Preflight]:
-    """All of them, checked two at a time, all temporary files in one folder."""
+    """All of them, four at a time, for many just wait; all temporary files in one folder."""
     defects = sorted(hostile.DEFECTS, key=lambda d: d.bounds.call)  # those that wait come first
     names = [*(d.name for d in defects), *GOOD]
     bounds = [*(d.bounds for d in defects), hostile.BOUNDS, hostile.BOUNDS]
     paths = [hostile.path(name) for name in names]
 
-    def check_half(half: int) -> list[tuple[str, Preflight]]:
+    def check_some(first: int) -> list[tuple[str, Preflight]]:
         with Supervisor() as supervisor:
             return [
                 (
                     names[k],
                     check_fmu(paths[k], control=False, supervisor=supervisor, bounds=bounds[k]),
                 )
-                for k in range(half, len(names), 2)
+                for k in range(first, len(names), AT_ONCE)
             ]
 
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(2) as pool:
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(AT_ONCE) as pool:
         patch.setattr(tempfile, "tempdir", str(folder))
-        return dict(pair for half in pool.map(check_half, (0, 1)) for pair in half)
+        return dict(pair for some in pool.map(check_some, range(AT_ONCE)) for pair in some)
 
 
 @pytest.mark.parametrize("name", GOOD)
