@@ -4,8 +4,9 @@
 
 The run is made in rounds of equal length, each with fresh worker processes. In each, one worker is
 killed and one is stopped for good, so that it does not answer: all instances in it are brought back
-from their snapshots. After each round the memory of this process, its descriptors, children,
-temporary folders and mapped FMUs are counted.
+from their snapshots. Besides, sensors are biased, stuck and noisy, an actuator is slow and messages
+are lost, each for a tenth of the round. After each round the memory of this process, its
+descriptors, children, temporary folders and mapped FMUs are counted.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+import numpy as np
 from faulty import faulty_fmu, faulty_plant, faulty_system
 
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.conditions import Episode
 from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation
 from posmas_fmi.cosim.master import Progress
 from posmas_fmi.cosim.worker.minder import resident
@@ -59,6 +62,23 @@ def strikes(plant: FmuPlant, steps: int) -> Progress:
     return strike
 
 
+def faults(steps: int) -> tuple[Episode, ...]:
+    """Return faults, each for a tenth of a round."""
+    arcs = np.arange(AGENTS)
+    what = [
+        ("sensor_offset", (2, 0), 0.1),
+        ("sensor_gain", (4, 0), 0.0),
+        ("sensor_noise", (6, 0), 0.05),
+        ("actuator_gain", (1, 0), 0.2),
+        ("loss", arcs, 0.5),
+    ]
+    tenth = steps // 10
+    return tuple(
+        Episode(kind, index, value, k * 2 * tenth, (k * 2 + 1) * tenth)
+        for k, (kind, index, value) in enumerate(what)
+    )
+
+
 def main() -> None:
     """Print a row after each round."""
     import logging
@@ -73,7 +93,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         tempfile.tempdir = folder
         fmu = faulty_fmu(Path(folder))
-        system = faulty_system(AGENTS, until=0.05 * steps)
+        system = faulty_system(AGENTS, until=0.05 * steps, episodes=faults(steps))
         choice = engine.choose(system.law, "c")
         print("round  plant h  wall s  MiB  descriptors  children  folders  maps  restarts")
         for number in range(1, arguments.rounds + 1):
