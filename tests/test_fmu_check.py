@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import hostile
 import pytest
 from fmu_examples import tank_fmu
 
@@ -17,6 +18,7 @@ from posmas_fmi.fmu.check.described import read_description
 from posmas_fmi.fmu.check.description import description_findings, strict_findings
 from posmas_fmi.fmu.check.finding import worst
 from posmas_fmi.fmu.check.image import ImageError, read_image
+from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.xml import MAX_DEPTH, scan
 from posmas_fmi.fmu.compile import host
 
@@ -252,3 +254,21 @@ def test_what_is_there_twice_with_the_same_content(good: Path, tmp_path: Path) -
     assert [(f.severity, f.place) for f in findings] == [("warning", "extra/a.xml")]
     unpack(path, tmp_path / "out")
     assert (tmp_path / "out" / "extra" / "a.xml").read_bytes() == b"<a/>"
+
+
+def test_a_description_that_breaks_a_rule_is_reported_and_used(tmp_path: Path) -> None:
+    """FMPy refuses both mistakes, also where it does not validate; real FMUs have them."""
+    content = hostile.corpus.entries(2)
+    good = content[hostile.corpus.XML].decode()
+    plain = 'causality="local" variability="continuous">\n      <Real unit="K"/>'
+    odd = 'causality="parameter" variability="constant">\n      <Real declaredType="T" start="0"/>'
+    assert plain in good
+    path = tmp_path / "odd.fmu"
+    content[hostile.corpus.XML] = good.replace(plain, odd).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+    made = check_fmu(path, control=False)
+    assert "not-valid" in [finding.code for finding in made.findings]
+    assert made.results["steps"] > 10
+    assert made.exit_code == 0

@@ -14,6 +14,7 @@ import numpy as np
 from posmas_fmi.errors import ArchiveError, FmuError, InputError
 from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry
 from posmas_fmi.fmu.clocks import Clock, read_clocks
+from posmas_fmi.fmu.tolerant import mended
 from posmas_fmi.fmu.units import Conversion, Units
 from posmas_fmi.fmu.variables import Ports, Variable, Variables
 
@@ -173,11 +174,24 @@ def read_description(place: Path, path: Path) -> Any:
     """
     import fmpy
 
+    def read(source: Any) -> Any:
+        return fmpy.read_model_description(source, validate=False)
+
     try:
-        found = fmpy.read_model_description(str(place), validate=False)
+        try:
+            found = read(str(place))
+        except Exception as refused:  # FMPy and lxml raise many kinds
+            try:
+                found = read(mended(_description(place)))
+            except Exception:
+                raise refused from None
         return complete_fmi1(found, place) if found.fmiVersion == "1.0" else found
     except Exception as error:  # FMPy and lxml raise many kinds
         raise ArchiveError(f"cannot read modelDescription.xml: {error}", str(path)) from error
+
+
+def _description(place: Path) -> bytes:
+    return (place / DESCRIPTION).read_bytes() if place.is_dir() else read_entry(place, DESCRIPTION)
 
 
 def complete_fmi1(description: Any, place: Path) -> Any:
@@ -185,8 +199,7 @@ def complete_fmi1(description: Any, place: Path) -> Any:
 
     Their values are those of other variables with the other sign, which would be read wrongly.
     """
-    data = (place / DESCRIPTION).read_bytes() if place.is_dir() else read_entry(place, DESCRIPTION)
-    root = ElementTree.fromstring(data)
+    root = ElementTree.fromstring(_description(place))
     capabilities = root.find("Implementation/*/Capabilities")
     if capabilities is not None:
         for name, value in capabilities.attrib.items():
