@@ -91,6 +91,7 @@ def integral_design(
     Examples
     --------
     >>> from posmas_fmi.agent import linear_agent
+    >>> from posmas_fmi.certify.quadratic import symmetric_scalar
     >>> from posmas_fmi.network import network_from_arcs
     >>> tank = linear_agent([[-0.1]], [[1.0]], [[1.0]])
     >>> one = symmetric_scalar(network_from_arcs(1, [], [1]), (1.0, 1.0))
