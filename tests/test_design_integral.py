@@ -15,8 +15,8 @@ from posmas_fmi.cli import main
 from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.mapping import line_agent
 from posmas_fmi.design import DesignSettings, certify, design
+from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.integral_gains import augmented, integral_design
-from posmas_fmi.design.lmi import graph_scalar
 from posmas_fmi.errors import DesignError, InputError
 from posmas_fmi.network import Network, network_from_arcs
 

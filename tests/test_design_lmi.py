@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.certify import Loop, quadratic
 from posmas_fmi.design import DesignSettings, design, lmi
+from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.paper_examples import EXAMPLE_1, EXAMPLE_2
 from posmas_fmi.design.rounding import nearest
 from posmas_fmi.design.sampled import sampled_feedback
@@ -19,7 +20,7 @@ from posmas_fmi.network import Network, network_from_arcs
 
 def kappa(example: object, pin: int) -> float:
     agent, network = example.agent(), example.network(pin)  # type: ignore[attr-defined]
-    graph = lmi.graph_scalar(network, (agent.m_l, agent.m_h))
+    graph = graph_scalar(network, (agent.m_l, agent.m_h))
     # the reference figures leave |H|l out of the Metzler condition
     found = lmi.feedback_gain(agent, network, example.phi, graph, 6, agent.A)  # type: ignore[attr-defined]
     assert found.proof.positive
@@ -39,7 +40,7 @@ def test_graph_scalar_bounds_the_quadratic_form_of_every_nonlinearity() -> None:
     rng = np.random.default_rng(0)
     network = EXAMPLE_1.network(2)
     low, high = 0.9, 1.2
-    found = lmi.graph_scalar(network, (low, high))
+    found = graph_scalar(network, (low, high))
     M = network.pinned_laplacian.toarray()
     for _ in range(2000):
         q = rng.normal(size=4)
@@ -176,7 +177,7 @@ def test_gains_of_several_inputs_are_rounded_first_and_proved_as_they_are(
     agent, phi = TWO_INPUTS, 3.0
     sector = (agent.m_l, agent.m_h)
     graph = (
-        lmi.graph_scalar(network, sector)
+        graph_scalar(network, sector)
         if kind == "diagonal"
         else quadratic.symmetric_scalar(network, sector)
     )
@@ -204,7 +205,7 @@ def test_gains_of_several_inputs_are_rounded_first_and_proved_as_they_are(
 def test_quadratic_function_of_the_sampled_loop_falls_in_every_period(network: Network) -> None:
     agent = attrs.evolve(EXAMPLE_1.agent("tanh"), lipschitz=0.2 if network is DIGRAPH else 0.02)
     h, ell = 0.001, float(np.max(agent.ell))
-    graph = lmi.graph_scalar(network, (0.9, 1.2))
+    graph = graph_scalar(network, (0.9, 1.2))
     if network is PATH:
         graph = quadratic.symmetric_scalar(network, (0.9, 1.2))
     assert graph is not None
@@ -247,7 +248,7 @@ def test_a_graph_scalar_of_many_agents_is_proved_in_floating_point() -> None:
     n = 40
     arcs = [(i, i + 1) for i in range(1, n)] + [(i + 1, i) for i in range(1, n, 2)]
     network = network_from_arcs(n, arcs, [1, 9, 17, 25, 33])
-    found = lmi.graph_scalar(network, (0.9, 1.1))
+    found = graph_scalar(network, (0.9, 1.1))
     assert "verified Cholesky" in found.proof.method
     M = network.pinned_laplacian.toarray()
     T = np.diag(found.Theta) @ M

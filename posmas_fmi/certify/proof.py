@@ -163,11 +163,6 @@ def positive_definite(M: Any) -> Definiteness:
     return Definiteness(estimate, -np.inf, "exact rational LDL^T fails")
 
 
-def negative_definite(M: Any) -> Definiteness:
-    """Prove ``-M`` positive definite; estimate and bound are about -M."""
-    return positive_definite(-M)
-
-
 def verified_cholesky(M: Array, inexact: float = 0.0) -> Definiteness:
     """Lower bound of the smallest eigenvalue from one Cholesky factorisation of ``M - αI``.
 

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import attrs
 import numpy as np
 
+from posmas_fmi.agent import Agent
 from posmas_fmi.certify.enclosure import matmul, middle, typed
 from posmas_fmi.certify.flow import Flow
 from posmas_fmi.certify.loop import Loop
@@ -163,6 +164,12 @@ def graph_proof(
 
 
 # ---- one agent -----------------------------------------------------------------------------------
+
+
+def lipschitz_norm(agent: Agent) -> float:
+    """Bound β of the Euclidean Lipschitz constant: ``√(‖ℓ‖₁‖ℓ‖_∞)``, exact for diagonal ℓ = βI."""
+    ell = agent.ell
+    return float(np.sqrt(ell.sum(axis=0).max() * ell.sum(axis=1).max())) * (1 + 1e-12)
 
 
 def feedback_matrix(

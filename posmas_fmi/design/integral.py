@@ -19,8 +19,9 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.certify import Loop, baseline
 from posmas_fmi.certify.certificate import Certificate
 from posmas_fmi.certify.diverging import divergence
-from posmas_fmi.certify.quadratic import GraphScalar, step_of, symmetric_scalar
+from posmas_fmi.certify.quadratic import GraphScalar, lipschitz_norm, step_of, symmetric_scalar
 from posmas_fmi.design.gains import checked_gains, loop_of
+from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.integral_certificate import certificate, refuting
 from posmas_fmi.design.integral_gains import (
     IntegralDesign,
@@ -30,7 +31,6 @@ from posmas_fmi.design.integral_gains import (
     nothing,
 )
 from posmas_fmi.design.integral_given import as_designed, guessed, judged, no_graph
-from posmas_fmi.design.lmi import graph_scalar, lipschitz_norm
 from posmas_fmi.design.result import Baseline, Design
 from posmas_fmi.design.sampled import sampled_gain
 from posmas_fmi.design.settings import DesignSettings

@@ -14,6 +14,7 @@ from posmas_fmi.certify.certificate import Certificate, Condition
 from posmas_fmi.certify.closed_loop import Prover, m_matrix
 from posmas_fmi.certify.diverging import Divergence
 from posmas_fmi.certify.quadratic import SampledProof
+from posmas_fmi.certify.weights import Weights
 from posmas_fmi.design.integral_gains import IntegralDesign, exact_gain
 from posmas_fmi.design.sampled import sampled_condition, sampled_feedback, sampled_observer
 from posmas_fmi.expression import Array, VectorFunction, symbol
@@ -66,13 +67,7 @@ def certificate(
         else:
             conditions.append(sampled_condition("I: sampled loop contracts", proof, h))
             rate = -math.log(proof.factor) / h
-    observer = Prover(loop, loop.estimator(weights), weights)
-    contracts, observer_rate = observer.contracts, observer.rate
-    if not contracts.holds and h is not None:
-        proof = sampled_observer(loop)
-        if proof is not None:
-            contracts = sampled_condition("I: sampled observer contracts", proof, h)
-            observer_rate = -math.log(proof.factor) / h
+    contracts, observer_rate, continuous = _observer(loop, weights)
     conditions.append(contracts)
     return Certificate(
         assumptions=tuple(found),
@@ -83,9 +78,20 @@ def certificate(
         p_max=loop.network.p_max,
         period=h,
         rate_continuous=made.kappa if sampled is None and made.proof.positive else None,
-        observer_rate_continuous=observer.continuous,
+        observer_rate_continuous=continuous,
         covers=_covers(agent) if all(c.holds for c in conditions) else (),
     )
+
+
+def _observer(loop: Loop, weights: Weights) -> tuple[Condition, float | None, float | None]:
+    """Contraction of the observer, its rate, and that of the continuous one."""
+    observer = Prover(loop, loop.estimator(weights), weights)
+    if not observer.contracts.holds and loop.period is not None:
+        proof = sampled_observer(loop)
+        if proof is not None:
+            condition = sampled_condition("I: sampled observer contracts", proof, loop.period)
+            return condition, -math.log(proof.factor) / loop.period, observer.continuous
+    return observer.contracts, observer.rate, observer.continuous
 
 
 def refuting(loop: Loop, diverges: Divergence) -> Certificate:

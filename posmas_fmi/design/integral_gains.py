@@ -13,8 +13,7 @@ import numpy as np
 from posmas_fmi.agent import Agent
 from posmas_fmi.certify.proof import Definiteness, positive_definite, rational
 from posmas_fmi.certify.proof import dyadic as exactly
-from posmas_fmi.certify.quadratic import GraphScalar, feedback_matrix, mismatch
-from posmas_fmi.design.lmi import lipschitz_norm
+from posmas_fmi.certify.quadratic import GraphScalar, feedback_matrix, lipschitz_norm, mismatch
 from posmas_fmi.design.rounding import nearest
 from posmas_fmi.design.solver import cvxpy, solve
 from posmas_fmi.errors import DesignError

@@ -12,7 +12,13 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.certify import Loop
-from posmas_fmi.certify.quadratic import GraphScalar, SampledProof, Step, prove_sampled
+from posmas_fmi.certify.quadratic import (
+    GraphScalar,
+    SampledProof,
+    Step,
+    lipschitz_norm,
+    prove_sampled,
+)
 from posmas_fmi.design.integral_gains import (
     IntegralDesign,
     augmented,
@@ -20,7 +26,6 @@ from posmas_fmi.design.integral_gains import (
     nothing,
     prove,
 )
-from posmas_fmi.design.lmi import lipschitz_norm
 from posmas_fmi.design.sampled import sampled_feedback, sampled_gain
 from posmas_fmi.design.settings import DesignSettings
 from posmas_fmi.design.solver import cvxpy, solve

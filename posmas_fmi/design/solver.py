@@ -61,3 +61,11 @@ def solve(problem: Any, what: str) -> bool:
             "$.design.method",
         )
     return problem.status in _USABLE
+
+
+def feasible(program: Any, slack: Any) -> bool:
+    """Whether the solver finds a strictly feasible point; its failures count as no."""
+    try:
+        return solve(program, "bisection") and slack.value is not None and slack.value > 1e-7
+    except DesignError:
+        return False
