@@ -292,7 +292,7 @@ def _show_design(made: Design, as_json: bool) -> int:
                     f"              {'; '.join(filter(None, (condition.proof, condition.detail)))}"
                 )
         for text in certificate.covers:
-            print(f"  covers: {text}")
+            print(f"  {'' if text.startswith('not covered') else 'covers: '}{text}")
         for note in made.notes:
             print(f"  note: {note}")
     return DONE if made.certificate.certified != "no" else NEGATIVE

@@ -121,7 +121,7 @@ def _covers(agent: Agent) -> tuple[str, ...]:
         f"every nonlinearity with slopes in [{low:g}, {high:g}], per agent; within a period the "
         "input's effect is that of the state at its start",
         "constant loads, unequal from agent to agent: what is integrated has no offset",
-        "not covered: delays and losses of messages (try them with the falsifier or in a run), "
+        "not covered: delays and losses of messages (a run with them is evidence only), "
         "saturation that the integrals wind up against, and positivity, which has to be structural",
     )
 
