@@ -19,6 +19,9 @@ from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.integral_gains import augmented, integral_design
 from posmas_fmi.errors import DesignError, InputError
 from posmas_fmi.network import Network, network_from_arcs
+from posmas_fmi.scenario import load
+from posmas_fmi.scenario.coverage import coverage
+from posmas_fmi.scenario.job import make_design_of
 
 # a cooling line: plate, return and supply temperatures; heat retained at the supply
 LINE = linear_agent(
@@ -201,12 +204,7 @@ def test_a_design_that_is_only_good_in_continuous_time_is_not_taken() -> None:
     assert found.factor > 1
 
 
-def test_the_integral_design_is_chosen_in_a_scenario(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "tanks.toml"
-    path.write_text(
-        """
+TANKS = """
 [scenario]
 name = "tanks"
 until = 10.0
@@ -227,9 +225,26 @@ method = "integral"
 integrates = ["y1"]
 [leader]
 s0 = [1.0]
-""",
-        encoding="utf-8",
-    )
+"""
+
+
+def test_delays_are_not_covered_by_the_integral_certificate(tmp_path: Path) -> None:
+    path = tmp_path / "late.toml"
+    path.write_text(TANKS + "[channel]\ndelay = 0.5\n", encoding="utf-8")
+    scenario = load(path)
+    made = make_design_of(scenario)
+    assert made.certificate.certified == "yes"
+    assert any(text.startswith("not covered: delays") for text in made.certificate.covers)
+    (row,) = coverage(scenario, made)
+    assert (row["what"], row["covered"]) == ("delay of messages", False)
+    assert "certificate D is not proved" in row["why"]
+
+
+def test_the_integral_design_is_chosen_in_a_scenario(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "tanks.toml"
+    path.write_text(TANKS, encoding="utf-8")
     assert main(["design", str(path), "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     assert made["certified"] == "yes"
