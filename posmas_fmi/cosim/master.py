@@ -244,6 +244,9 @@ class Outcome:
         Or that whose FMU asked for the end.
     incidents : tuple of Failure
         FMUs that failed, and what was done about it.
+    replay_noise : float or None
+        What a step that was done again differed by, relative to the size of a reading or 1; None
+        where none was.
     """
 
     ended: Literal["complete", "terminated", "diverged", "failed", "cancelled"]
@@ -259,6 +262,7 @@ class Outcome:
     reason: str = ""
     failed_agent: str = ""
     incidents: tuple[Failure, ...] = ()
+    replay_noise: float | None = None
 
 
 def simulate(
@@ -417,6 +421,7 @@ class Run:
             reason=reason,
             failed_agent=agent,
             incidents=tuple(self.plant.failures),
+            replay_noise=None if self.system.iteration is None else self.replay_noise,
         )
 
     def _loop(self, interrupt: Interrupt) -> None:

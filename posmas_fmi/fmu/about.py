@@ -105,6 +105,21 @@ class About:
         told = self.description
         return told.coSimulation if self.kind == "Co-Simulation" else told.modelExchange
 
+    def require_interface(self) -> None:
+        """Refuse an FMU of which no interface is run.
+
+        Raises
+        ------
+        FmuError
+        """
+        told = self.description
+        if told.coSimulation is None and told.modelExchange is None:
+            raise FmuError(
+                "expected an interface for Co-Simulation or Model Exchange (it has Scheduled "
+                "Execution only, which is not run)",
+                str(self.path),
+            )
+
     @cached_property
     def units(self) -> Units:
         """The units that it defines."""

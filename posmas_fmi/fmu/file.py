@@ -105,6 +105,7 @@ class FmuFile:
         where = str(self.path)
         about = About.of(self.path, read_description(folder, self.path), self.kind)
         self.about = about.structured(self._structure)
+        self.about.require_interface()
         interface = self.about.interface
         if interface is None:
             raise FmuError(f"expected a {self.kind} interface (it has none)", where)

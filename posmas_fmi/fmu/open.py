@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from posmas_fmi.errors import FmuError
 from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.binding import Trace
 from posmas_fmi.fmu.callbacks import Messages
@@ -32,12 +31,7 @@ def open_fmu(
         If it is for Scheduled Execution only, or has no binary that loads here.
     """
     about = read_about(Path(path))
-    if about.interface is None:
-        raise FmuError(
-            "expected an interface for Co-Simulation or Model Exchange (it has Scheduled Execution "
-            "only, which is not run)",
-            str(path),
-        )
+    about.require_interface()
     kind: type[FmuFile] = FmuFile if about.kind == "Co-Simulation" else SteppedFile
     if about.version == 1:
         kind = Fmi1File if about.kind == "Co-Simulation" else Fmi1SteppedFile

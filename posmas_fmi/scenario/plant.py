@@ -136,6 +136,7 @@ def make_instances(
     for path, given in zip(files, values, strict=True):
         if path not in abouts:  # structural parameters are the same for all instances of a file
             abouts[path] = read_about(path).structured(given)
+            abouts[path].require_interface()
     every = _periods(scenario)
     _check_periods(scenario, [abouts[path] for path in files], every)
     shows_states = _shows_states(scenario)

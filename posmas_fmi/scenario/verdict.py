@@ -40,7 +40,9 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         }
         for k, name in enumerate(names)
     ]
+    noise = outcome.replay_noise
     return {
+        **({} if noise is None else {"replay_noise": _finite(noise)}),
         "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
         "ended": outcome.ended,
         "reason": outcome.reason or _frozen_reason(outcome),
