@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from faulty import faulty_fmu, faulty_plant, faulty_system, values
@@ -128,12 +129,17 @@ def test_a_fault_ends_the_run_with_a_verdict(fmu: Path, fault: str) -> None:
     assert len(x) == 11
 
 
-@pytest.mark.parametrize("fault", ["segfault", "hang", "error", "not a number"])
+@pytest.mark.parametrize(
+    ("fault", "apart"),
+    [
+        *(("segfault", "process"), ("hang", "process"), ("error", "process")),
+        *(("not a number", "process"), ("error", "none"), ("not a number", "none")),
+    ],
+)
 @pytest.mark.parametrize("action", ["stop", "freeze"])
-def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, action: str) -> None:
-    here, there = (
-        run(fmu, {1: values(fault)}, isolation(action, 0.3), loop) for loop in ("c", "numpy")
-    )
+def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, apart: Any, action: str) -> None:
+    how = attrs.evolve(isolation(action, 0.3), mode=apart)
+    here, there = (run(fmu, {1: values(fault)}, how, loop) for loop in ("c", "numpy"))
     np.testing.assert_allclose(here[1], there[1], rtol=1e-12)
     assert here[0].ended == there[0].ended == ("failed" if action == "stop" else "complete")
     assert here[0].reason == there[0].reason
@@ -145,8 +151,6 @@ def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, action: str) -> N
 @pytest.mark.parametrize("apart", ["process", "none"])
 @pytest.mark.parametrize("loop", ["c", "numpy"])
 def test_a_frozen_agent_stays_and_the_others_go_on(fmu: Path, apart: Any, loop: str) -> None:
-    import attrs
-
     outcome, x = run(
         fmu, {1: values("error", at=0.5)}, attrs.evolve(isolation("freeze"), mode=apart), loop
     )

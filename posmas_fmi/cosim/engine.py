@@ -16,7 +16,7 @@ from posmas_fmi.cosim import native
 from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
-from posmas_fmi.cosim.fmus import Incident, Report
+from posmas_fmi.cosim.fmus import READING, Incident, Report
 from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
 from posmas_fmi.cosim.master import (
@@ -674,14 +674,15 @@ class Engine:
         time_now = self._system.clock.time(self._e.k)
         self._plant.fmus.warn(self._reports[0], time_now)
         if self._incidents is not None and self._e.ended == _GOES_ON:
-            self._note_incidents(time_now)
+            self._note_incidents()
 
-    def _note_incidents(self, time_now: float) -> None:
+    def _note_incidents(self) -> None:
         """Take down which instances have failed in the last step of the slice."""
         assert self._incidents is not None
+        begin, end = (self._system.clock.time(k) for k in (max(self._e.k - 1, 0), self._e.k))
         for number, incident in enumerate(self._incidents):
             if incident.call and not self._plant.fmus.is_remote(number):  # they tell themselves
-                self._plant.fmus.freeze(incident, time_now)
+                self._plant.fmus.freeze(incident, end if incident.call in READING else begin)
             incident.call = 0
         self._e.halt = int(self._halted)
 
