@@ -2,6 +2,8 @@
  * time `at`. */
 #define _GNU_SOURCE
 #include <fcntl.h>
+#include <fenv.h>
+#include <locale.h>
 #include <math.h>
 #include <signal.h>
 #include <stddef.h>
@@ -32,7 +34,8 @@ typedef struct {
 
 enum {
     NOTHING, SEGFAULT, ABORT, EXIT, HANG, ERROR, FATAL, DISCARD, OUTSIDE, NOT_A_NUMBER, STACK,
-    MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES
+    MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES,
+    CHANGES
 };
 
 static int instances;
@@ -98,6 +101,12 @@ static int go_wrong(Plant *p)
     case CLOSES:
         for (int k = 3; k < 256; k++)
             close(k);
+        break;
+    case CHANGES: /* what it shares with the others in its process */
+        fesetround(FE_UPWARD);
+        setlocale(LC_ALL, "C");
+        if (chdir("/"))
+            abort();
         break;
     case ONCE: { /* the first time that a process of this folder gets here */
         const char *mark = getenv("POSMAS_TEST_MARK");

@@ -198,6 +198,19 @@ def test_log_floods_and_closed_descriptors(fmu: Path, caplog: pytest.LogCaptureF
     assert outcome.ended in ("complete", "failed")  # it is over before the worker sees it, or not
 
 
+def test_what_an_fmu_changes_in_its_process_is_put_back(fmu: Path) -> None:
+    """Rounding would change the numbers of the others, the folder the files that they open."""
+    _, healthy = run(fmu, {}, isolation())
+    with faulty_plant(fmu, {1: values("changes", at=0.2)}, isolation()) as plant:
+        rows: list[np.ndarray] = []
+        pid = plant._instances[0].worker.pid
+        before = os.readlink(f"/proc/{pid}/cwd")
+        engine.run(faulty_system(), plant, lambda t, v: rows.append(v["x"][..., 0].copy()))
+        plant._instances[0].get("x")  # it has answered: what the last step changed is put back
+        assert os.readlink(f"/proc/{pid}/cwd") == before != "/"
+    np.testing.assert_array_equal(np.concatenate(rows)[:, 0], healthy[:, 0])
+
+
 def test_a_fault_at_the_start_is_an_error_of_the_start(fmu: Path) -> None:
     for fault in ("segfault", "exit"):
         with pytest.raises(FmuLostError, match=r"faulty\.fmu: 2: fmi2ExitInitializationMode"):

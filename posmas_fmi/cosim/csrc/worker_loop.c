@@ -5,6 +5,7 @@
 #include <time.h>
 
 #include "export.h"
+#include "surroundings.h"
 
 #if defined __linux__
 #include <linux/futex.h>
@@ -57,6 +58,7 @@ static void do_order(const WorkerLoop *w, int64_t i, int64_t order)
     Report report = {{0}, {0}, 0};
     if (!s->steps || fmus_step(w->fmus, i, s->t, s->h, inputs, w->scratch, &report))
         fmus_read(w->fmus, i, readings, w->scratch, &report);
+    surroundings_put_back_floats(); /* the next may be another FMU */
     w->head->calling.call = CALL_NONE;
     s->report = report;
     __atomic_store_n(&s->done, order, __ATOMIC_RELEASE);
@@ -80,6 +82,7 @@ EXPORT void worker_run(WorkerLoop *w)
             __atomic_thread_fence(__ATOMIC_SEQ_CST);
             if (__atomic_load_n(&head->waiting, __ATOMIC_SEQ_CST))
                 word_wake(&head->turn);
+            surroundings_put_back();
             continue;
         }
         /* a request may be read before it is counted here */
@@ -113,6 +116,7 @@ EXPORT int64_t worker_replay(const WorkerLoop *w, int64_t i, const double *rows,
     }
     if (k == n)
         fmus_read(w->fmus, i, inputs_of(s) + inputs, w->scratch, &report);
+    surroundings_put_back();
     w->head->calling.call = CALL_NONE;
     s->report = report;
     return k;

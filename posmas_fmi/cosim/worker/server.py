@@ -76,6 +76,7 @@ class Server:
         self._head = memory.head
         self._library = load(Path(settings.library))
         layout.check(self._library)
+        self._library.surroundings_keep()
         self._library.worker_run.argtypes = [ctypes.c_void_p]
         self._library.worker_run.restype = None
         self._replay = self._library.worker_replay
@@ -103,6 +104,7 @@ class Server:
             self._loop.answered += 1
             self._said.clear()
             content, data = self._answer(request)
+            self._library.surroundings_put_back()
             self._head.doing = b""
             frames.send(self._link, {**content, "said": self._said}, data)
         for file in self._files.values():
