@@ -82,8 +82,11 @@ scale = 0.5
 
 @pytest.fixture(scope="module")
 def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    target, folder = host(), tmp_path_factory.mktemp("ramp")
-    code = (RAMP / "model.c").read_text()
+    return made(tmp_path_factory.mktemp("ramp"), (RAMP / "model.c").read_text())
+
+
+def made(folder: Path, code: str) -> Path:
+    target = host()
     library = shared_library({"model.c": code}, ["model.c"], "ramp", target)
     with zipfile.ZipFile(folder / "ramp.fmu", "w") as archive:
         archive.write(RAMP / "modelDescription.xml", "modelDescription.xml")
@@ -184,3 +187,23 @@ def test_an_fmu_that_does_not_interpolate_is_held(ramp: Path, tmp_path: Path) ->
     (tmp_path / "load.csv").write_text((ramp / "load.csv").read_text())
     expected = results(ramp, "none", which="none")["y"].values
     np.testing.assert_array_equal(results(tmp_path, "held")["y"].values, expected)
+
+
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_an_fmu_that_only_says_so(
+    tmp_path: Path, isolation: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without the function inputs are held; where it returns Error, the remedy is named."""
+    code = (RAMP / "model.c").read_text()
+    name = "fmi2SetRealInputDerivatives"
+    folder = made(tmp_path, code.replace(name, "other"))
+    held = results(folder, "held", which="none", isolation=isolation)["y"].values
+    found = results(folder, "lacking", isolation=isolation)["y"].values
+    np.testing.assert_array_equal(found, held)
+    assert "has no function for it" in caplog.text
+    made(tmp_path, code.replace("references[k] > V ||", "").replace("orders[k] != 1", "1"))
+    results(tmp_path, "refuses", isolation=isolation)
+    summary = json.loads((tmp_path / "refuses" / "summary.json").read_text())
+    assert summary["verdict"] == "failed"
+    assert f"{name}: returned status 3 (Error)" in summary["reason"]
+    assert 'input_derivatives = "none"' in summary["reason"]

@@ -159,6 +159,8 @@ _CALLS = (
 )
 _TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
 DIED, DEADLINE, INTERRUPTED = 8, 9, 10  # of an FMU in another process
+SET_RATES = 11
+HOLD_THEM = '; [scenario] input_derivatives = "none" holds the inputs'
 READING = (6, _NOT_FINITE)  # calls after a step
 
 
@@ -384,12 +386,17 @@ class Fmus:
         """How input derivatives are set."""
         if not names:
             return None, None, None, 0
-        n = len(names)
+        n, function = len(names), _optional(file, "fmi2SetRealInputDerivatives")
+        if function is None:
+            _LOG.warning(
+                "%s says that it interpolates inputs, but has no function for it: they are held",
+                file.path.name,
+            )
         references = (ctypes.c_uint32 * n)(*(file.variable(name).reference for name in names))
         orders = (ctypes.c_int32 * n)(*[1] * n)
         self._keep += [references, orders]
         places = ctypes.addressof(references), ctypes.addressof(orders)
-        return file.address("fmi2SetRealInputDerivatives"), *places, n
+        return function, *places, n
 
     def _served_rates(self, file: FmuFile, names: tuple[str, ...]) -> tuple[int | None, ...]:
         """How Python sets them: their number stands for all."""
@@ -504,7 +511,10 @@ class Fmus:
         if failure.call == _NOT_FINITE:
             name = self._readings[failure.instance].variables[failure.port]
             return instance.not_finite(name, failure.value)
-        return instance.status_error(function, failure.status, messages)
+        error = instance.status_error(function, failure.status, messages)
+        if failure.call == SET_RATES:
+            error.message += HOLD_THEM
+        return error
 
     def _call_of(self, incident: Any, time: float) -> tuple[FmuInstance, str, Sequence[str]]:
         instance = self._instances[incident.instance]

@@ -14,7 +14,15 @@ import numpy as np
 
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.failure import Failure
-from posmas_fmi.cosim.fmus import DEADLINE, DIED, Incident, PortMap, call_name
+from posmas_fmi.cosim.fmus import (
+    DEADLINE,
+    DIED,
+    HOLD_THEM,
+    SET_RATES,
+    Incident,
+    PortMap,
+    call_name,
+)
 from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker import layout
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
@@ -211,6 +219,7 @@ class Remote:
         if incident.call == 5:
             return Failure(**facts, call=call, cause=f"returned early at {incident.value!r} s")
         cause = f"returned status {incident.status} ({status_label(incident.status)})"
+        cause += HOLD_THEM if incident.call == SET_RATES else ""
         return Failure(**facts, call=call, cause=cause, status=incident.status)
 
     def error(self, incident: Incident) -> FmuCallError:
