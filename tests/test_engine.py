@@ -25,6 +25,7 @@ from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.errors import BuildError, FmuCallError, InputError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu import build
+from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 from posmas_fmi.network import Network, network_from_arcs
 from posmas_fmi.protocol import make_protocol
@@ -356,6 +357,17 @@ def test_an_fmu_may_end_the_simulation(
             assert f"fmi{fmi}DoStep: asked to end the simulation at 0.3" in outcome.reason
             assert outcome.incidents == ()
             assert outcome.steps == len(rows["time"]) - 1 == 30
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_to_end_the_simulation_is_no_error_of_a_trial(
+    fmi: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for old, new in ENDS[fmi]:
+        changed(monkeypatch, fmi, old, new.replace("0.295", "0.0"))
+    found = check_fmu(build.fmu(fragile(), fmi, cache=tmp_path), control=False).findings
+    assert {f.severity for f in found if f.code == "terminates"} == {"note"}
+    assert not [f for f in found if f.severity in ("error", "fatal")]
 
 
 STEP = "    Status status =\n        instance_step("

@@ -41,13 +41,16 @@ class Journal:
     ----------
     last : float
         Duration of the last call [s].
+    discarded : bool
+        Whether a step of FMI 2 returned Discard, which has not been judged.
     """
 
     def __init__(self, board: Board, surroundings: Surroundings) -> None:
         self.board, self.surroundings = board, surroundings
         self.last = 0.0
         self._known: set[tuple[str, str]] = set()
-        self._failed = False
+        self._failed = self._judged = False
+        self.discarded = False
         self.messages, self.bytes = 0, 0
 
     @property
@@ -69,6 +72,13 @@ class Journal:
     def result(self, **values: Any) -> None:
         """Write results down."""
         self.board.add({"result": values})
+
+    def judge_discard(self) -> None:
+        """Note that a step was discarded, and not because the FMU wants to end the simulation."""
+        if self.discarded:
+            self.discarded, self._judged = False, True
+            self._status("fmi2DoStep", 2)
+            self._judged = False
 
     def told(self) -> bool:
         """Whether a status was noted since the last time this was asked."""
@@ -100,6 +110,9 @@ class Journal:
             self.note("warning", "status-warning", name, "it returned Warning")
             return
         self._failed = True
+        if (name, result) == ("fmi2DoStep", 2) and not self._judged:
+            self.discarded = True  # whether it is a wish to end, it is asked next
+            return
         code = f"status-{_CODES[result]}" if 0 < result < len(_CODES) else "status-unknown"
         self.note(
             self.severity,

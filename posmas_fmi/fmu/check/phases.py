@@ -12,7 +12,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, PosmasError
+from posmas_fmi.errors import ArchiveError, FmuCallError, FmuEndedError, FmuError, PosmasError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.check.journal import Journal, TrialMessages
 from posmas_fmi.fmu.check.surroundings import descriptors, resident, threads
@@ -94,7 +94,12 @@ class Trial:
             board.enter(name, vital=name == "life")
             try:
                 PHASES[name](self)
+            except FmuEndedError as error:
+                journal.told()
+                journal.discarded = False
+                self._failed(error.message, error.where.rpartition(": ")[2])
             except FmuCallError as error:
+                journal.judge_discard()
                 if not journal.told():
                     self._failed(error.message, error.where.rpartition(": ")[2])
             except ArchiveError as error:
