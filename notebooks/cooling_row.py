@@ -150,10 +150,11 @@ bottom.set_title("Supply temperature: mean of the row, and its coolest to warmes
 bottom.legend(loc="lower right", ncols=3)
 
 # %% [markdown]
-# With ample water, and every line knowing its set-point, today's practice wins: a PI controller
-# per line with feedforward of the measured IT power. The proportional consensus leaves an offset
-# whenever the load is not the nominal one. The distributed integral removes it, but slowly: the
-# row starts too cold, only line 1 knows the set-point, and the others learn it from each other.
+# With ample water a PI controller per line with feedforward of the measured IT power keeps the
+# set-point best, if every line knows it. The distributed controller with the same feedforward is
+# worse by hundredths of a kelvin, with half the valve travel and only line 1 told the set-point.
+# Feedforward does it: the integral alone learns a swing that all lines share slowly, through line
+# 1. The proportional consensus leaves an offset whenever the load is not the nominal one.
 #
 # ## Too little water
 #
@@ -209,7 +210,8 @@ assert min(gain.values()) > 0.4
 # Comparisons like these ship as scenarios, `posmas-fmi run cooling_common_mode` and
 # `cooling_shortage`, with more controllers and a page of key figures.
 #
-# The sharing costs something: with ample water the distributed controller is worse than PI by the
-# figures of the first table. No run here is a proof: certificate P, C and T above are about the
-# proportional form, and what is proved of each controller is said in
+# The sharing costs something: with ample water the distributed controller is worse than PI with
+# feedforward by the figures of the first table. No run here is a proof: certificate P, C and T
+# above are about the proportional form, `posmas-fmi design cooling_integral` has one of the
+# integral form, and what is proved of each controller is said in
 # `posmas_fmi.cooling.control.WHAT_IS_PROVED`.

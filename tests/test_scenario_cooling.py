@@ -19,6 +19,7 @@ from posmas_fmi.cosim import engine
 from posmas_fmi.design.integral_certificate import slope_assumption
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.network import network_from_arcs
+from posmas_fmi.report.reading import read_run
 from posmas_fmi.scenario.build import shipped_scenarios
 from posmas_fmi.scenario.compare import controllers
 from posmas_fmi.scenario.cooling import INTEGRAL_TIME, cooling_law, proved, with_slope
@@ -266,6 +267,10 @@ def test_a_row_with_a_proved_integral_says_so_and_what_is_beyond_it(delay, tmp_p
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "no offset" in page
     assert ("the loop without delay" in page) == (delay > 0)
+    # the table and the drawing are about supply temperatures, not about states of other loads
+    assert "of the supply temperature from the set-point" in page
+    told = [agent["final_error"] for agent in result.summary["agents"]]
+    np.testing.assert_allclose(read_run(tmp_path).final_error, told)
     # the same row under the proportional law keeps one
     droops = run(
         attrs.evolve(scenario, control=ControlTable("proportional")), tmp_path / "p", report=False
@@ -282,3 +287,23 @@ def test_other_gains_or_another_line_have_no_proof_of_the_slope() -> None:
     assert scenario.cooling is not None
     bare = attrs.evolve(scenario.agent, slope=None)
     assert with_slope(bare, own, scenario.cooling) is bare
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "place", "message"),
+    [
+        ("[60e3, 50e3, 120e3]", "[60e3, -50e3, 120e3]", "$.signals.load", "line 2 at 60 s"),
+        ("[[80e3, 40e3, 120e3], [60e3, 50e3, 120e3]]", "[80.0, 60.0]", "$.signals.load", "1e3"),
+        ("times = [0.0, 60.0]", 'unit = "kW"\ntimes = [0.0, 60.0]', "$.signals.load.unit", "1e3"),
+        ("agents = 3", "agents = 0", "$.network.agents", "2 agents or more"),
+    ],
+)
+def test_nonsense_loads_and_rows_are_refused(tmp_path, text, instead, place, message) -> None:
+    path = tmp_path / "row.toml"
+    assert text in ROW
+    path.write_text(ROW.replace(text, instead), encoding="utf-8")
+    with pytest.raises(ScenarioError) as error:
+        load(path)
+    ((where, told),) = error.value.problems
+    assert where == place
+    assert message in told

@@ -116,7 +116,8 @@ class Incident:
 class Summary:
     """What ``summary.json`` says about the run; derived from the results if the run was cut off.
 
-    `coverage` is None for a run that does not say what it used.
+    `coverage` is None for a run that does not say what it used, `band` for one that is no cooling
+    row: about such a row it says how far supply temperatures are from the set-point.
     """
 
     verdict: str
@@ -132,6 +133,7 @@ class Summary:
     coverage: tuple[Used, ...] | None = None
     faults: tuple[Fault, ...] = ()
     incidents: tuple[Incident, ...] = ()
+    band: float | None = None
 
     @property
     def uncovered(self) -> tuple[str, ...]:
@@ -236,7 +238,13 @@ class Run:
 
     @cached_property
     def final_error(self) -> Array:
-        """Largest entry of the tracking error of each agent at the last sample, (N,)."""
+        """Largest entry of the tracking error of each agent at the last sample, (N,).
+
+        Lines of a cooling row have other loads than the leader: there it is what the summary says.
+        """
+        told = [agent.final_error for agent in self.summary.agents]
+        if self.summary.band is not None and len(told) == self.N and None not in told:
+            return np.array(told, dtype=float)
         if not self.time.size:
             return np.full(self.N, np.nan)
         return np.asarray(np.abs(self.tracking_error[-1]).max(axis=-1))

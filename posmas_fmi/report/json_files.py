@@ -224,6 +224,7 @@ def summary_facts(content: dict[str, Any], path: Path) -> Summary:
         steps=None if steps is None or math.isinf(steps) else int(steps),
         comparison=keys.mapping("comparison"),
         notes=(*keys.texts("messages"), *_traffic(keys)),
+        band=keys.number("band_K") if "band_K" in content else None,
         coverage=tuple(
             Used(row.text("what"), row.flag("covered"), row.text("why", ""))
             for row in keys.objects("coverage", required=False)

@@ -53,8 +53,14 @@ class _Scale:
 
 def _scale(run: Run) -> _Scale:
     first = np.abs(run.tracking_error[:1])
-    largest = float(first[np.isfinite(first)].max(initial=0.0)) or 1.0
+    largest = run.summary.band or float(first[np.isfinite(first)].max(initial=0.0)) or 1.0
     return _Scale(10.0 ** math.ceil(math.log10(min(max(largest, 1e-200), 1e200)) - 1e-9))
+
+
+def _of_what(run: Run) -> str:
+    if run.summary.band is not None:
+        return " of the supply [K]"
+    return " |x − s|" if run.x is not None else " |x̂ − s|"
 
 
 def network_figure(run: Run, name: str, alt: str) -> str:
@@ -224,14 +230,16 @@ def _key(figure: Figure, run: Run, scale: _Scale, height: float) -> None:
     axes.set_yticks([])
     axes.grid(False)
     axes.spines[:].set_visible(False)
+    start = "as at the start" if run.summary.band is None else "the band [K]"
     axes.set_xticks(
-        [0, 1], [f"≤ {power_of_ten(scale.low)}", f"{power_of_ten(scale.high)}, as at the start"]
+        [0, 1], [f"≤ {power_of_ten(scale.low)}", f"{power_of_ten(scale.high)}, {start}"]
     )
     axes.tick_params(length=0, pad=2)
-    what = "|x − s|" if run.x is not None else "|x̂ − s|"
     beyond = any(scale.exceeded(e) for e in run.final_error)
-    more = "; vermilion: larger than at the start" if beyond else ""
-    axes.set_title(f"final error {what}{more}", loc="center", fontweight="normal", pad=3)
+    more = "; vermilion: ten times that" if beyond and run.summary.band is not None else ""
+    if beyond and run.summary.band is None:
+        more = "; vermilion: larger than at the start"
+    axes.set_title(f"final error{_of_what(run)}{more}", loc="center", fontweight="normal", pad=3)
 
 
 def _summary(run: Run) -> Figure:
@@ -286,7 +294,7 @@ def _summary(run: Run) -> Figure:
         right.plot(across[lost], top, ls="none", marker="X", ms=5, mew=0, color=VERMILION,
                    transform=right.get_xaxis_transform(), label="lost")  # fmt: skip
     right.set_xlabel("arcs from the leader" if profile is None else "p: how far the leader is")
-    right.set_ylabel("final error" + (" |x − s|" if run.x is not None else " |x̂ − s|"))
+    right.set_ylabel(f"final error{_of_what(run)}")
     right.set_title("Final error against distance")
     right.legend(loc="best")
     return figure

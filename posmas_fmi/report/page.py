@@ -146,7 +146,9 @@ def _agent_rows(run: Run) -> list[AgentRow]:
                 hears=", ".join([*names, *more]),
                 p=show(None if run.p_profile is None else float(run.p_profile[i])),
                 status=verdicts[i].status if verdicts else "",
-                final_error=_last_error(run.tracking_error, i),
+                final_error=_last_error(run.tracking_error, i)
+                if run.summary.band is None
+                else show(float(run.final_error[i])),
                 estimation_error=_last_error(estimation, i),
                 lowest=show(verdicts[i].min_state) if verdicts else "–",
                 lost_at=show(float(run.lost_at[i])) if np.isfinite(run.lost_at[i]) else "",

@@ -504,6 +504,8 @@ def make_network(table: NetworkTable, folder: Path) -> Network:
 
 def _ring(agents: int, hops: list[int]) -> list[list[float]]:
     """Arcs of a ring in which agent i hears i - k for each of the hops k."""
+    if agents < 2:
+        raise InputError(f"expected 2 agents or more in a ring (got {agents})", "$.network.agents")
     for k, hop in enumerate(hops):
         if not 1 <= hop < agents or hop in hops[:k]:
             raise InputError(

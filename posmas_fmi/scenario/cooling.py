@@ -26,7 +26,7 @@ from posmas_fmi.design import Design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
-from posmas_fmi.scenario.signals import read_signal
+from posmas_fmi.scenario.signals import Signal, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
     ControlTable,
@@ -43,6 +43,7 @@ NOMINAL = LineParameters()
 PREDICTIVE = "mpc"
 FACILITY = "facility"
 HELD_ABOVE_DEW_POINT = 2.0  # K
+SMALL_LOAD = 0.01  # of the nominal load: below it a unit is wrong
 RECORDED = (
     "supply_temperature",
     "return_temperature",
@@ -124,6 +125,7 @@ def expand(
         scenario.period,
         scenario.seed,
     )
+    _check_load(load, signals[cooling.load], float(size.max()), f"$.signals.{cooling.load}")
     first = np.broadcast_to(load.at(np.zeros(1))[0], (n,))
     values = [_start(cooling, float(s), float(p)) for s, p in zip(size, first, strict=True)]
     common = values[0]
@@ -177,6 +179,28 @@ def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
             raise InputError(
                 f"expected a number >= 0 (got {getattr(cooling, key):g})", f"$.cooling.{key}"
             )
+
+
+def _check_load(load: Signal, table: SignalTable, size: float, place: str) -> None:
+    """Heat loads are watts and not negative."""
+    if table.unit not in (None, "W"):
+        raise InputError(
+            f"heat loads are read in W (got {table.unit!r}); write scale = 1e3 for kW instead",
+            f"{place}.unit",
+        )
+    if load.values.min() < 0:
+        k, column = np.argwhere(load.values < 0)[0]
+        value, line = load.values[k, column], f" of line {column + 1}" * (load.values.shape[1] > 1)
+        raise InputError(
+            f"expected heat loads >= 0 W (got {value:g}{line} at {load.time[k]:g} s)", place
+        )
+    largest, nominal = load.values.max(), NOMINAL.P0 * size
+    if 0 < largest < SMALL_LOAD * nominal:
+        raise InputError(
+            f"the largest heat load is {largest:g} W, of lines of {nominal:g} W; for a table in kW "
+            "write scale = 1e3",
+            place,
+        )
 
 
 def _agent(cooling: CoolingTable, line: LineParameters, integral: bool) -> dict[str, Any]:
