@@ -19,6 +19,7 @@ from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import FmuCallError, FmuError
 from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.archive import read_entry
+from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.clocks import read_clocks
 from posmas_fmi.fmu.compile import host, shared_library
 from posmas_fmi.fmu.event_mode import EventFile, EventInstance
@@ -52,6 +53,17 @@ def sampler(clocked: Path) -> Iterator[EventInstance]:
         with file.instantiate("s") as instance:
             instance.initialise({"gain": 2.0}, stop=10.0)
             yield instance
+
+
+def test_check_tries_clocks_in_event_mode(tmp_path: Path) -> None:
+    """Some FMUs do not start without it (found on one that is public)."""
+    code = (CLOCKED / "model.c").read_text()
+    begin = "    Sampler *s = calloc(1, sizeof *s);\n"
+    strict = code.replace(begin, f"    if (!events)\n        return NULL;\n{begin}")
+    assert strict != code
+    made = check_fmu(packed(tmp_path, strict), control=False)
+    assert "no-instance" not in [finding.code for finding in made.findings]
+    assert made.results["steps"] > 10
 
 
 def test_clocks_are_read_from_the_description(clocked: Path) -> None:

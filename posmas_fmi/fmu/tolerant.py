@@ -18,6 +18,7 @@ _LEGAL = {
     "discrete": ("input", "output", "local"),
     "continuous": ("input", "output", "local", "independent"),
 }
+_KNOWN = {causality for allowed in _LEGAL.values() for causality in allowed}
 
 
 def mended(description: bytes) -> io.BytesIO:
@@ -43,7 +44,7 @@ def mended(description: bytes) -> io.BytesIO:
         for element in (variable, *variable):
             if element.get("declaredType", "") not in types:
                 element.attrib.pop("declaredType", None)
-        if variable.get("initial") is None and not _is_legal(variable):
+        if variable.get("initial") is None and _is_odd(variable):
             variable.set("initial", "exact")  # what is said of it is taken as it is
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as file:
@@ -52,7 +53,9 @@ def mended(description: bytes) -> io.BytesIO:
     return archive
 
 
-def _is_legal(variable: ElementTree.Element) -> bool:
-    """Whether causality and variability go together; one that is left out has a default."""
+def _is_odd(variable: ElementTree.Element) -> bool:
+    """Whether causality and variability, each one of the standard, do not go together."""
     causality, variability = variable.get("causality", "local"), variable.get("variability")
-    return variability is None or causality in _LEGAL.get(variability, ())
+    if variability not in _LEGAL or causality not in _KNOWN:
+        return False  # one that is left out has a default; what is not known stays refused
+    return causality not in _LEGAL[variability]

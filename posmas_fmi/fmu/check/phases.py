@@ -14,9 +14,11 @@ import numpy as np
 
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuEndedError, FmuError, PosmasError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.check.journal import Journal, TrialMessages
 from posmas_fmi.fmu.check.surroundings import descriptors, resident, threads
 from posmas_fmi.fmu.evaluation import default_step, saves_state, start_time
+from posmas_fmi.fmu.event_mode import EventFile, needs_event_mode
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.fmi1 import Fmi1File, Fmi1SteppedFile
 from posmas_fmi.fmu.instance import FmuInstance
@@ -84,6 +86,8 @@ class Trial:
         kind: type[FmuFile] = FmuFile if co_simulation else ModelExchangeFile
         if self.job.major == 1:
             kind = Fmi1File if co_simulation else Fmi1SteppedFile
+        elif self.job.major == 3 and needs_event_mode(read_about(Path(self.job.fmu))):
+            kind = EventFile  # clocks tick in Event Mode only: some refuse to start without it
         return kind(self.job.fmu, self.messages, self.journal.call, Path(self.job.unpacked))
 
     def run(self) -> None:
@@ -477,7 +481,7 @@ def _for_control(trial: Trial) -> FmuFile:
     if trial.file.description.modelExchange is not None:
         with suppress(FmuError):
             return ModelExchangeFile(*arguments)
-    return FmuFile(*arguments)
+    return type(trial.file)(*arguments)
 
 
 def unload(trial: Trial) -> None:
