@@ -344,7 +344,7 @@ DESCRIPTION = [
     Defect("no name", "a variable without a name", "error", "name-missing",
            change=_xml('name="net" ', "")),
     Defect("causality", "a causality that there is not", "error", "causality",
-           change=_xml('causality="local"', 'causality="inward"')),
+           verdict=3, change=_xml('causality="local"', 'causality="inward"')),
     Defect("no type", "a variable without a type", "error", "type-missing",
            verdict=3, change=_xml('<Real start="0" unit="K"/>', "")),
     Defect("reference negative", "a negative value reference", "fatal", "reference",
