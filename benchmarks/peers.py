@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import io
+import os
 import sys
 import tempfile
 import zipfile
@@ -200,8 +201,29 @@ class Peer:
 
 
 @contextmanager
+def temporary_files() -> Iterator[None]:
+    """Let a peer leave what it unpacks in a folder that goes away with it."""
+    before = os.environ.get("TMPDIR")
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["TMPDIR"] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ["TMPDIR"]
+            else:
+                os.environ["TMPDIR"] = before
+
+
+@contextmanager
 def libcosim(loop: Loop, observe: bool = False) -> Iterator[Peer]:
-    """libcosim's fixed-step algorithm."""
+    """libcosim's fixed-step algorithm; the folders that it unpacks to and leaves are removed."""
+    with temporary_files(), _libcosim(loop, observe) as peer:
+        yield peer
+
+
+@contextmanager
+def _libcosim(loop: Loop, observe: bool) -> Iterator[Peer]:
     try:
         from libcosimpy.CosimExecution import CosimExecution
         from libcosimpy.CosimLogging import CosimLogLevel, log_output_level
