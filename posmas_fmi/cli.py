@@ -7,6 +7,7 @@ import json
 import logging
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -37,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 done, 1 a verdict is negative, 2 bad input, 3 an FMU failed, 130 cancelled.
     """
+    if argv is None:
+        keep_interrupts()
     arguments = _parser().parse_args(argv)
     logging.basicConfig(level=logging.DEBUG if arguments.verbose else logging.WARNING)
     try:
@@ -53,6 +56,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
         sys.stderr.close()
         return DONE
+
+
+def keep_interrupts() -> None:
+    """See that no Ctrl-C is lost, for a process that does one command.
+
+    Python swallows an exception that comes up while it frees an object, with a traceback on
+    stderr. If that exception is Ctrl-C, it is raised again a moment later.
+    """
+
+    def swallowed(it: Any) -> None:
+        if not issubclass(it.exc_type, KeyboardInterrupt):
+            sys.__unraisablehook__(it)
+            return
+        again = threading.Timer(0.01, signal.raise_signal, [signal.SIGINT])
+        again.daemon = True
+        again.start()
+
+    sys.unraisablehook = swallowed
 
 
 # ---- the commands -------------------------------------------------------------------------------

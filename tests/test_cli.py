@@ -332,3 +332,21 @@ def test_the_text_of_a_design_tells_baseline_band_and_region(tmp_path, capsys):
     printed = capsys.readouterr().out
     for words in ("with K = 0", "attracted from |delta| <= ", "at most 1: 0.", "covers: arbitrary"):
         assert words in printed
+
+
+def test_ctrl_c_while_an_object_is_freed_is_not_lost():
+    code = (
+        "import time\n"
+        "from posmas_fmi.cli import keep_interrupts\n"
+        "class Freed:\n"
+        "    def __del__(self):\n"
+        "        raise KeyboardInterrupt\n"
+        "keep_interrupts()\n"
+        "try:\n"
+        "    Freed()\n"
+        "    time.sleep(20)\n"
+        "except KeyboardInterrupt:\n"
+        "    print('came')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("came", "")
