@@ -208,9 +208,13 @@ Status instance_get(Instance *c, const uint32_t vr[], size_t n, double value[], 
             know_outputs(c);
         else if (vr[i] >= AT_DX)
             know_derivatives(c);
-        Status one = expect_finite(c, vr[i], (unsigned)size, STATUS_ERROR);
-        status = one > status ? one : status;
-        memcpy(value + done, c->state.v + vr[i], size * sizeof *value);
+        int finite = 1; /* few values: a loop is quicker than memcpy */
+        for (size_t j = 0; j < size; j++) {
+            value[done + j] = c->state.v[vr[i] + j];
+            finite &= isfinite(value[done + j]) != 0;
+        }
+        if (!finite)
+            status = expect_finite(c, vr[i], (unsigned)size, STATUS_ERROR);
         done += size;
     }
     return done == n_values ? status : wrong_count(c, n_values);
@@ -251,8 +255,11 @@ Status instance_set(Instance *c, const uint32_t vr[], size_t n, const double val
                 return STATUS_ERROR;
             }
         /* Setting a value again leaves what is known of the derivatives as it is. */
-        if (memcmp(c->state.v + vr[i], value + done, size * sizeof *value) != 0) {
-            memcpy(c->state.v + vr[i], value + done, size * sizeof *value);
+        for (size_t j = 0; j < size; j++) {
+            double *to = &c->state.v[vr[i] + j];
+            if (memcmp(to, &value[done + j], sizeof *to) == 0)
+                continue;
+            *to = value[done + j];
             c->state.dx_known = c->state.y_known = 0;
         }
         done += size;
