@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import resource
 import signal
@@ -196,4 +197,21 @@ def test_folders_of_the_dead_are_swept_and_those_of_the_living_stay(
     assert sweep() == [left]
     assert mine.folder.is_dir()
     mine.cleanup()
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_while_a_folder_is_made_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = tempfile.mkdtemp
+
+    def interrupted(prefix: str) -> str:
+        folder = made(prefix=prefix, dir=tmp_path)
+        signal.raise_signal(signal.SIGINT)
+        return folder
+
+    monkeypatch.setattr(tempfile, "mkdtemp", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Scratch()
+    gc.collect()
     assert not list(tmp_path.iterdir())
