@@ -29,10 +29,11 @@ def whole(path: Path, mode: str = "w") -> Iterator[IO[Any]]:
     Examples
     --------
     >>> import tempfile
-    >>> path = Path(tempfile.mkdtemp(), "facts.txt")
-    >>> with whole(path) as file:
-    ...     _ = file.write("all")
-    >>> path.read_text()
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "facts.txt")
+    ...     with whole(path) as file:
+    ...         _ = file.write("all")
+    ...     path.read_text()
     'all'
     """
     partial = path.with_name(f"{path.name}.partial")

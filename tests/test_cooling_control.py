@@ -21,6 +21,7 @@ from posmas_fmi.cooling.law import (
     FALLBACK,
     LineControllers,
     Memory,
+    messages,
     own_values,
     start_memory,
 )
@@ -145,7 +146,7 @@ def test_c_and_numpy_agree(library, name):
         disagreement = random.normal(size=(6, 4))
         silence = np.where((random.random((6, 1)) < 0.2), 300.0, 0.0) * np.ones(2)
         np.testing.assert_allclose(
-            in_c.send(memory, measured), stated.messages(memory, measured), rtol=1e-15
+            in_c.send(memory, measured), messages(stated.control, memory, measured), rtol=1e-15
         )
         expected = stated.step(k * H, measured, disagreement, silence, memory)
         for got, wanted in zip(

@@ -118,6 +118,13 @@ def start_memory(xhat: Array, reference: float) -> Array:
     ).rows()
 
 
+def messages(control: Control, memory: Array, measured: Array) -> Array:
+    """Return what each line sends, (N, 4): its estimate, and its supply or set-point."""
+    was = Memory.of(memory)
+    shared = was.reference if control.law == "set_point" else measured[:, 1]
+    return np.column_stack([was.xhat, shared])
+
+
 class LineControllers:
     """The controllers of all lines, stated line by line in arrays.
 
@@ -149,12 +156,6 @@ class LineControllers:
         """Return the set-point at a time [K above the facility's nominal supply]."""
         v = self.values
         return float((v["set_before"] if t < v["set_at"][0] else v["set_after"])[0])
-
-    def messages(self, memory: Array, measured: Array) -> Array:
-        """Return what each line sends, (N, 4): its estimate, and its supply or set-point."""
-        was = Memory.of(memory)
-        shared = was.reference if self.control.law == "set_point" else measured[:, 1]
-        return np.column_stack([was.xhat, shared])
 
     def loads(self, measured: Array) -> Array:
         """Return IT powers over the nominal loads; 1 where it is not measured."""
@@ -409,7 +410,7 @@ class CoolingLaw(CompiledLaw):
 
     def send(self, memory: Array, measured: Array) -> Array:
         """Return the message of each line."""
-        return self.at(1.0).messages(memory, measured)
+        return messages(self.control, memory, measured)
 
     def step(
         self,

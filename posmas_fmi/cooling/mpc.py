@@ -19,8 +19,8 @@ from posmas_fmi.cooling.line import LineParameters
 from posmas_fmi.cooling.mapping import valve_mapping
 from posmas_fmi.cooling.plant import FACILITY
 from posmas_fmi.cosim.law import Decision, Heard, Weights
-from posmas_fmi.design.solver import cvxpy
-from posmas_fmi.errors import InputError
+from posmas_fmi.design.solver import cvxpy, solve
+from posmas_fmi.errors import DesignError, InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
 
@@ -296,12 +296,11 @@ class PredictiveLaw:
         program["up"].value = np.repeat(1 - y[:, None], len(moves), axis=1)
         lengths = np.array([end - begin for begin, end in zip(moves, ends, strict=True)])
         program["rate"].value = lengths * h / self.stroke_time
-        cp = cvxpy()
         try:
-            program["problem"].solve(solver=cp.CLARABEL)
-        except cp.error.SolverError:
-            return np.zeros(len(y))
+            solved = solve(program["problem"], "predictive control")
+        except DesignError:  # the solver broke down: the valves stay for a period
+            solved = False
         z = program["z"].value
-        if z is None or not math.isfinite(float(np.abs(z).max())):
+        if not solved or z is None or not math.isfinite(float(np.abs(z).max())):
             return np.zeros(len(y))
         return np.asarray(z[:, 0])

@@ -17,7 +17,6 @@ from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.fmus import READING, Incident, Report
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
 from posmas_fmi.cosim.master import (
     DIVERGED,
@@ -33,6 +32,7 @@ from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, arrivals_state, set_arrivals
 from posmas_fmi.errors import BuildError, FmuEndedError, InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.interrupt import Interrupt
 
 log = logging.getLogger(__name__)
 

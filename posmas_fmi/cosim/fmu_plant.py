@@ -26,7 +26,6 @@ from posmas_fmi.cosim.fmus import (
     PortMap,
     Whole,
 )
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerProcess, require
 from posmas_fmi.cosim.worker.proxy import RemoteFile, RemoteInstance
@@ -40,6 +39,7 @@ from posmas_fmi.fmu.model import element_names
 from posmas_fmi.fmu.open import open_fmu
 from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
 from posmas_fmi.fmu.units import Conversion
+from posmas_fmi.interrupt import Interrupt
 
 log = logging.getLogger(__name__)
 

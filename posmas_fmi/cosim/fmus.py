@@ -12,11 +12,11 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim.failure import Action, Failure
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.served import Served, needs_python
 from posmas_fmi.errors import FmuCallError, FmuEndedError, FmuError
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
 from posmas_fmi.fmu.variables import Ports
+from posmas_fmi.interrupt import Interrupt
 
 if TYPE_CHECKING:
     from posmas_fmi.expression import Array
@@ -157,11 +157,11 @@ _CALLS = (
     *("", "Set", "Get", "DoStep", "DoStep", "DoStep", "Get", "Get", "DoStep", "DoStep", ""),
     "SetRealInputDerivatives",
 )
-_TERMINATED, _EARLY, _NOT_FINITE = 4, 5, 7
+TERMINATED, EARLY, NOT_FINITE = 4, 5, 7
 DIED, DEADLINE, INTERRUPTED = 8, 9, 10  # of an FMU in another process
 SET_RATES = 11
 HOLD_THEM = '; [scenario] input_derivatives = "none" holds the inputs'
-READING = (6, _NOT_FINITE)  # calls after a step
+READING = (6, NOT_FINITE)  # calls after a step
 
 
 def call_name(call: int, fmi: int) -> str:
@@ -506,9 +506,9 @@ class Fmus:
             return instance.error(function, raised.message)
         if raised is not None:
             raise raised
-        if failure.call in (_TERMINATED, _EARLY):
-            return instance.ended_early(failure.call == _TERMINATED, failure.value)
-        if failure.call == _NOT_FINITE:
+        if failure.call in (TERMINATED, EARLY):
+            return instance.ended_early(failure.call == TERMINATED, failure.value)
+        if failure.call == NOT_FINITE:
             name = self._readings[failure.instance].variables[failure.port]
             return instance.not_finite(name, failure.value)
         error = instance.status_error(function, failure.status, messages)

@@ -15,13 +15,13 @@ from posmas_fmi.cosim.channel import Channel, Mailbox
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
 from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
 from posmas_fmi.cosim.failure import Failure
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.law import Heard, Law, Weights, columns
 from posmas_fmi.cosim.plant import Plant
 from posmas_fmi.cosim.snapshot import Snapshot, Snapshots
 from posmas_fmi.cosim.wiring import Whole, Wiring
 from posmas_fmi.errors import FmuCallError, FmuEndedError
 from posmas_fmi.expression import Array
+from posmas_fmi.interrupt import Interrupt
 from posmas_fmi.network import Network
 
 log = logging.getLogger(__name__)

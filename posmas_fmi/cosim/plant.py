@@ -11,8 +11,8 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.failure import Failure
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.expression import Array
+from posmas_fmi.interrupt import Interrupt
 
 Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
 Truths = np.ndarray[tuple[int], np.dtype[np.bool_]]

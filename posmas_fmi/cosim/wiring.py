@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from posmas_fmi.expression import Array
 
 Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
+Flags = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 class Drive(Interface):
@@ -159,6 +160,12 @@ class Wiring:
         return made[0], made[1]
 
     @cached_property
+    def _rates(self) -> tuple[Flags, Flags]:
+        """Which extra inputs are rates, and which go on with one."""
+        extras = self.flat
+        return np.array([e.is_rate for e in extras]), np.array([e.has_rate for e in extras])
+
+    @cached_property
     def extrapolates(self) -> bool:
         """Whether an input goes on as the readings do that it is made of."""
         return any(e.is_rate and any(t.source >= 0 for t in e.terms) for e in self.flat)
@@ -181,9 +188,7 @@ class Wiring:
         width = of_readings.shape[1]
         found = of_readings @ readings[:width]
         if begin is not None and rates is not None:
-            is_rate, has_rate = (
-                np.array([getattr(e, name) for e in self.flat]) for name in ("is_rate", "has_rate")
-            )
+            is_rate, has_rate = self._rates
             found = np.where(has_rate, of_readings @ begin[:width], found)
             found = np.where(is_rate, of_readings @ rates[:width], found)
         return np.asarray(self.bias + found + of_drive @ drive)

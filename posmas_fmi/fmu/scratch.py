@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import signal
 import tempfile
-import threading
 import weakref
-from collections.abc import Iterator
 from pathlib import Path
+
+from posmas_fmi.interrupt import Interrupt
 
 PREFIX = "posmas-fmi-"
 _LOCK = ".in-use"
@@ -39,11 +38,12 @@ class Scratch:
     """
 
     def __init__(self, prefix: str = PREFIX) -> None:
-        with _undisturbed():
+        with Interrupt(soon=True) as interrupt:  # or the folder is there and nobody knows
             self.folder = Path(tempfile.mkdtemp(prefix=prefix))
             handle = os.open(self.folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o600)
             _lock(handle)
             self._end = weakref.finalize(self, _release, self.folder, handle)
+        interrupt.check()
 
     def cleanup(self) -> None:
         """Remove the folder; a second call does nothing."""
@@ -86,23 +86,7 @@ def _lock(handle: int) -> bool:
 
 
 def _release(folder: Path, handle: int) -> None:
-    with _undisturbed():
+    with Interrupt(soon=True) as interrupt:
         os.close(handle)
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Let Ctrl-C wait: between making a folder and noting it, it would leave the folder behind."""
-    main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield
-        return
-    came: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    if came:
-        raise KeyboardInterrupt
+    interrupt.check()

@@ -17,19 +17,22 @@ from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.fmus import (
     DEADLINE,
     DIED,
+    EARLY,
     HOLD_THEM,
+    NOT_FINITE,
     SET_RATES,
+    TERMINATED,
     Incident,
     PortMap,
     call_name,
 )
-from posmas_fmi.cosim.interrupt import Interrupt
 from posmas_fmi.cosim.worker import layout
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.process import WorkerLost, WorkerProcess
 from posmas_fmi.cosim.worker.proxy import RemoteInstance
 from posmas_fmi.errors import FmuCallError, FmuError, FmuLostError
 from posmas_fmi.fmu.instance import FmuInstance, status_label
+from posmas_fmi.interrupt import Interrupt
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,7 +41,6 @@ SNAPSHOT_SHARE = 20.0  # and so many times as long as the last one took
 PAST = 64 * 2**20  # bytes of inputs that are kept for one instance
 TOO_SOON = 10  # steps after a restart within which a failure is final
 _FATAL = 4
-_TERMINATED = 4  # the call of an incident
 
 
 class Remote:
@@ -213,10 +215,10 @@ class Remote:
                 output=death.output,
             )
         call = call_name(incident.call, instance.file.version)
-        if incident.call == 7:  # not finite
+        if incident.call == NOT_FINITE:
             name = self._readings[number].variables[incident.port]
             return Failure(**facts, call=call, cause=f"{name} is not finite ({incident.value:g})")
-        if incident.call == 5:
+        if incident.call == EARLY:
             return Failure(**facts, call=call, cause=f"returned early at {incident.value!r} s")
         cause = f"returned status {incident.status} ({status_label(incident.status)})"
         cause += HOLD_THEM if incident.call == SET_RATES else ""
@@ -225,7 +227,7 @@ class Remote:
     def error(self, incident: Incident) -> FmuCallError:
         """Return an incident that ended the run as an error, and note it."""
         number = incident.instance
-        if incident.call == _TERMINATED:
+        if incident.call == TERMINATED:
             return self._remote[number].ended("DoStep", incident.value)
         if self._entries[number].given_up:
             failure = self._final[number]

@@ -472,13 +472,7 @@ def _for_control(trial: Trial) -> FmuFile:
     """Load the FMU as `linearise` does: for Model Exchange, if it can that."""
     job = trial.job
     arguments = (job.fmu, trial.messages, trial.journal.call, Path(job.unpacked))
-    if job.major == 1:
-        return (
-            Fmi1File(*arguments)
-            if job.interface == "Co-Simulation"
-            else Fmi1SteppedFile(*arguments)
-        )
-    if trial.file.description.modelExchange is not None:
+    if job.major != 1 and trial.file.description.modelExchange is not None:
         with suppress(FmuError):
             return ModelExchangeFile(*arguments)
     return type(trial.file)(*arguments)

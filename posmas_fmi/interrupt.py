@@ -1,4 +1,4 @@
-"""Ctrl-C while a run goes on: it ends the run between two steps, where nothing is half done."""
+"""Ctrl-C where nothing may be left half done: it is noted, and raised where that is over."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from typing import Any, Self
 class Interrupt:
     """Takes note of Ctrl-C instead of raising KeyboardInterrupt wherever the program stands.
 
-    The second Ctrl-C raises. In other threads than the main one, and where Ctrl-C means something
-    else already, nothing is changed.
+    The second Ctrl-C raises, unless what is done is over soon. In other threads than the main one,
+    and where Ctrl-C means something else already, nothing is changed.
+
+    Parameters
+    ----------
+    soon : bool
+        Whether what is done is over soon, so that no further Ctrl-C raises either.
 
     Attributes
     ----------
@@ -27,8 +32,9 @@ class Interrupt:
     True
     """
 
-    def __init__(self) -> None:
+    def __init__(self, soon: bool = False) -> None:
         self.wanted = False
+        self._soon = soon
         self._before: Any = None
 
     def __enter__(self) -> Self:
@@ -49,11 +55,11 @@ class Interrupt:
             signal.signal(signal.SIGINT, self._before)
 
     def _note(self, number: int, frame: Any) -> None:
-        if self.wanted:
+        if self.wanted and not self._soon:
             raise KeyboardInterrupt
         self.wanted = True
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C has come: called where a run can be ended."""
+        """Raise KeyboardInterrupt if Ctrl-C has come: called where nothing is half done."""
         if self.wanted:
             raise KeyboardInterrupt
