@@ -280,6 +280,14 @@ def test_design_by_contraction_imports_no_solver_of_lmis():
     assert done.stdout.splitlines()[-1] == "[]"
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_check_takes_a_path_from_where_one_is(fmi, tmp_path, monkeypatch, capsys):
+    path = tank_fmu(tmp_path, fmi)
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", path.name, "--in", "power", "--out", "temperature"]) == 0
+    assert capsys.readouterr().out.startswith(path.name)
+
+
 def test_check_prints_facts_findings_and_a_verdict(tmp_path, capsys):
     path = tank_fmu(tmp_path, 2)
     assert main(["check", str(path), "--in", "power", "--out", "net", "temperature"]) == 0

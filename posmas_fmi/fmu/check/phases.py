@@ -14,7 +14,7 @@ import numpy as np
 
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuEndedError, FmuError, PosmasError
 from posmas_fmi.expression import Array
-from posmas_fmi.fmu.about import read_about
+from posmas_fmi.fmu.about import About, read_description
 from posmas_fmi.fmu.check.journal import Journal, TrialMessages
 from posmas_fmi.fmu.check.surroundings import descriptors, resident, threads
 from posmas_fmi.fmu.evaluation import default_step, saves_state, start_time
@@ -82,13 +82,16 @@ class Trial:
     @cached_property
     def file(self) -> FmuFile:
         """The FMU; loaded when it is first asked for."""
+        path, unpacked = Path(self.job.fmu), Path(self.job.unpacked)
         co_simulation = self.job.interface == "Co-Simulation"
         kind: type[FmuFile] = FmuFile if co_simulation else ModelExchangeFile
         if self.job.major == 1:
             kind = Fmi1File if co_simulation else Fmi1SteppedFile
-        elif self.job.major == 3 and needs_event_mode(read_about(Path(self.job.fmu))):
+        elif self.job.major == 3 and needs_event_mode(
+            About.of(path, read_description(unpacked, path))
+        ):
             kind = EventFile  # clocks tick in Event Mode only: some refuse to start without it
-        return kind(self.job.fmu, self.messages, self.journal.call, Path(self.job.unpacked))
+        return kind(path, self.messages, self.journal.call, unpacked)
 
     def run(self) -> None:
         """Go through the parts."""
