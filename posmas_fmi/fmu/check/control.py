@@ -288,8 +288,8 @@ def lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "linear model", f"at {made['at']:g} s, by {made['method']}, error {error}"
     if not made["useful"]:
         yield "", "the error is too large: what follows is of little use"
-    kind = "states" if made["named"] else "coordinates without names"
-    yield kind, ", ".join(made["states"]) or "none"
+    unnamed = "" if made["named"] or not made["states"] else " (coordinates: it names no states)"
+    yield "states", (", ".join(made["states"]) or "none") + unnamed
     for name in "ABCD":
         rows = report["signs"][name]
         if rows:
