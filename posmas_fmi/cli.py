@@ -110,9 +110,9 @@ def _run(arguments: argparse.Namespace) -> int:
     result = run(
         scenario, folder, _progress, command=command, resume=arguments.resume, branch=branch
     )
-    summary, certificate = result.summary, result.design.certificate
+    summary = result.summary
     if arguments.json:
-        _print_json({**summary, "certified": certificate.certified, "folder": str(folder)})
+        _print_json({**summary, "certified": result.certified, "folder": str(folder)})
     elif summary["verdict"] == "compared" and "kpi" in summary:
         _show_comparison(summary)
         print(f"report     {folder / 'report.html'}")
@@ -120,9 +120,11 @@ def _run(arguments: argparse.Namespace) -> int:
         print(f"verdict    {summary['verdict']}")
         if summary["reason"]:
             print(f"           {summary['reason']}")
-        print(f"certified  {_certified(result.design)}")
+        of_law = result.certified == result.design.certificate.certified
+        other = "no (the certificate of the design is not about the law that ran)"
+        print(f"certified  {_certified(result.design) if of_law else other}")
         uncovered = [one["what"] for one in summary["coverage"] if not one["covered"]]
-        if uncovered:
+        if uncovered and result.certified != "no":
             print(f"           that does not cover {', '.join(uncovered)}")
         print(f"error      {_number(summary['tracking_error_final'])} to the leader at the end")
         print(f"min state  {_number(summary['min_state'])}")

@@ -208,6 +208,21 @@ def test_only_the_law_with_the_gains_of_the_design_has_its_certificate(designed)
     assert proved(ControlTable("proportional"), with_integral)["certified"] == "no"
 
 
+@pytest.mark.parametrize("law", ["integral_ff", "proportional"])
+def test_the_command_says_what_is_proved_of_the_law_that_ran(law, tmp_path, capsys) -> None:
+    path, out = tmp_path / "one.toml", tmp_path / "out"
+    text = ROW[: ROW.index("[controllers.slow]")].replace("until = 300.0", "until = 60.0")
+    path.write_text(f'{text}\n[control]\nlaw = "{law}"\n', encoding="utf-8")
+    code = cli.main(["run", str(path), "--out", str(out), "--json"])
+    told = json.loads(capsys.readouterr().out)["certified"]
+    assert told == json.loads((out / "design.json").read_text(encoding="utf-8"))["certified"]
+    assert told == ("no" if law == "integral_ff" else "yes")
+    assert told == "yes" or code == 1
+    cli.main(["run", str(path), "--out", str(out)])
+    other = "no (the certificate of the design is not about the law that ran)"
+    assert (other in capsys.readouterr().out) is (told == "no")
+
+
 def test_the_law_says_what_is_measured(row) -> None:
     plant = attrs.evolve(row.plant, measured={"power": "load", "water": "load", "vale": "kv"})
     with pytest.raises(ScenarioError) as error:

@@ -128,7 +128,7 @@ def run_comparison(
         write_json(folder / "manifest.json", manifest | {"controllers": list(runs)})
         if report and summary.get("kpi"):
             write_report(folder)
-        return RunResult(folder, designed, summary)
+        return RunResult(folder, designed, summary, designed.certificate.certified)
 
 
 def _all(

@@ -15,6 +15,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from posmas_fmi.certify.certificate import Verdict
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.conditions import Sensors
 from posmas_fmi.cosim.fmu_plant import FmuPlant
@@ -56,19 +57,20 @@ class RunResult:
     design : Design
     summary : dict
         As in summary.json.
+    certified : {"yes", "conditional", "no"}
+        Of what ran, as in design.json: the certificate of the design may be about another law. Of
+        a comparison it is that of the design.
     """
 
     folder: Path
     design: Design
     summary: dict[str, Any]
+    certified: Verdict
 
     @property
     def good(self) -> bool:
         """Whether the run converged (or all of a comparison ended) and is certified."""
-        return (
-            self.summary["verdict"] in ("converged", "compared")
-            and self.design.certificate.certified != "no"
-        )
+        return self.summary["verdict"] in ("converged", "compared") and self.certified != "no"
 
 
 def make_design_of(scenario: Scenario) -> Design:
@@ -250,7 +252,7 @@ def _run_in(
         log.warning("no report: $.record.variables leaves %s out", ", ".join(missing))
     elif report:
         write_report(folder)
-    return RunResult(folder, designed, summary)
+    return RunResult(folder, designed, summary, facts["certified"])
 
 
 def _simulate(
