@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from posmas_fmi.errors import FmuError
 from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.clocks import Clock
-from posmas_fmi.fmu.events import settle
+from posmas_fmi.fmu.events import settle, update_discrete_states
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.period import allows_steps_of_different_length
@@ -107,7 +107,7 @@ class EventInstance(FmuInstance):
     def exit_initialization(self) -> None:
         """Leave Initialization Mode, settle the discrete states, enter Step Mode."""
         super().exit_initialization()
-        self.next_event = settle(self)
+        self.next_event = settle(self, partial(update_discrete_states, self))
         for clock in self.file.clocks:
             if clock.periodic:
                 self._tick_at[clock] = self._begin + clock.tick(0)
@@ -216,7 +216,7 @@ class EventInstance(FmuInstance):
                 values = [self._waiting[name] for name in names]
                 super().write(self.file.ports(names), values)
                 self._held |= dict(zip(names, values, strict=True))
-            self.next_event = settle(self)
+            self.next_event = settle(self, partial(update_discrete_states, self))
             for clock in due:
                 self._ticks[clock] += 1
                 self._tick_at[clock] = (

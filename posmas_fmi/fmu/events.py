@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 
 import attrs
 
@@ -34,13 +35,8 @@ class EventInfo:
 
 
 def update_discrete_states(instance: FmuInstance) -> EventInfo:
-    """In Event Mode: update the discrete states once."""
+    """In Event Mode of FMI 2 or 3: update the discrete states once."""
     by = ctypes.byref
-    if instance.file.version == 1:
-        from posmas_fmi.fmu.fmi1 import Fmi1Model
-
-        assert isinstance(instance, Fmi1Model)
-        return instance.update_discrete_states()
     if instance.file.version == 2:
         from fmpy.fmi2 import fmi2EventInfo
 
@@ -60,8 +56,14 @@ def update_discrete_states(instance: FmuInstance) -> EventInfo:
     return EventInfo(again, terminate, nominals, states, time.value if defined else math.inf)
 
 
-def settle(instance: FmuInstance) -> float:
+def settle(instance: FmuInstance, update: Callable[[], EventInfo]) -> float:
     """In Event Mode: update the discrete states until no more is needed.
+
+    Parameters
+    ----------
+    instance : FmuInstance
+    update : callable
+        Updates them once.
 
     Returns
     -------
@@ -74,7 +76,7 @@ def settle(instance: FmuInstance) -> float:
         Also if the FMU asks to end the simulation, or the states do not settle.
     """
     for _ in range(_MOST_ITERATIONS):
-        info = update_discrete_states(instance)
+        info = update()
         if info.terminate:
             raise instance.ended(_name(instance), instance.time)
         if not info.again:

@@ -173,7 +173,9 @@ class Fmi1Model(_Fmi1Instance, SteppedInstance):
         found = _told(info)
         if found.terminate:
             raise self.ended("Initialize", self.time)
-        self.next_event = settle(self) if found.again else found.next_event
+        self.next_event = (
+            settle(self, self.update_discrete_states) if found.again else found.next_event
+        )
         self._runs = True
 
     def start(self) -> None:

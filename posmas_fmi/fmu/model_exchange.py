@@ -119,7 +119,7 @@ class ModelExchangeInstance(FmuInstance):
         self._settle()
 
     def _settle(self) -> None:
-        self.next_event = settle(self)
+        self.next_event = settle(self, self.update_discrete_states)
         self.call("EnterContinuousTimeMode")
 
     def update_discrete_states(self) -> EventInfo:
