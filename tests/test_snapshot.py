@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
-from test_system import SYSTEMS, fmu, plant, system  # noqa: F401  (fmu is a fixture)
+from test_system import SYSTEMS, H, fmu, plant, system  # noqa: F401  (fmu is a fixture)
 
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.cosim.snapshot import Snapshot, newest
@@ -138,3 +140,12 @@ def test_the_newest_snapshot_of_a_folder(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert newest(tmp_path, 100) == tmp_path / "30.npz"
     assert newest(tmp_path, 5) is None
+
+
+def test_thousands_of_snapshots_are_kept(fmu: Path) -> None:  # noqa: F811
+    """Each ends what the engine does at a time, whose length follows from what was done."""
+    kept: list[int] = []
+    definition = attrs.evolve(system(), clock=Clock.of(1200 * H, H))
+    outcome, _ = go(definition, fmu, engine.Snapshots(None, 1, lambda one: kept.append(one.k)))
+    assert outcome.ended == "complete"
+    assert kept == list(range(1, 1201))

@@ -651,7 +651,7 @@ class Engine:
             if every:
                 e.until = min(e.until, (e.k // every + 1) * every)
             self._feed(e.k, e.until)
-            began = time.perf_counter()
+            first, began = e.k, time.perf_counter()
             self._call()
             took = time.perf_counter() - began
             self._take(record)
@@ -661,7 +661,8 @@ class Engine:
             due = every and e.k % every == 0 and stop is None
             if due and e.ended == _GOES_ON and self._checkpoint is not None:
                 self._checkpoint(self.snapshot())
-            length = int(min(2 * length, max(1, length * SLICE / max(took, 1e-6))))
+            # by what was done: a slice often ends earlier, at a snapshot say
+            length = int(min(2 * length, max(1, (e.k - first) * SLICE / max(took, 1e-6))))
 
     def _call(self) -> None:
         self._pending = True
