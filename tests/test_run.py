@@ -233,6 +233,26 @@ def test_every_shipped_plant_can_be_named(tmp_path):
         run(scenario, tmp_path / "out")
 
 
+@pytest.mark.parametrize("recorded", ["", "[record]\nvariables = []\n"])
+def test_an_fmu_of_ones_own_needs_to_show_no_states(tmp_path, recorded):
+    """As the README says it: inputs and outputs are enough, all else at its defaults."""
+    shipped = fmu_files(load("paper_example_1"))[0]
+    (tmp_path / "mine.fmu").write_bytes(shipped.read_bytes())
+    scenario = changed(tmp_path, '"positive_agent"', '"mine.fmu"')
+    if recorded:
+        path = tmp_path / "case.toml"
+        path.write_text(path.read_text(encoding="utf-8") + recorded, encoding="utf-8")
+        scenario = load(str(path), until=0.1)
+    assert scenario.baseline
+    result = run(scenario, tmp_path / "out", report=not recorded)
+    assert result.summary["steps"] == 20
+    data = results(result)
+    assert len(data.time) == 21
+    if not recorded:
+        assert np.isfinite(data.y).all()
+        assert (result.folder / "report.html").exists()
+
+
 def test_what_is_no_fmu_is_an_fmu_error(tmp_path):
     (tmp_path / "plant.fmu").write_bytes(b"no archive")
     with pytest.raises(PosmasError) as caught:

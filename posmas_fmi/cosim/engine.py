@@ -497,8 +497,8 @@ class Engine:
         other += 8 * n * system.measured if self._noise else 0
         self._room = int(max(1, min(BLOCK // (row + other), system.clock.steps + 1)))
         self._rows: dict[str, Array] = {}
-        if wanted:
-            self._time = self._point("time", np.full(self._room, 0.0))
+        # also where nothing else is recorded, as x is not of FMUs that do not show it
+        self._time = self._point("time", np.full(self._room, 0.0))
         for name, shape in wanted.items():
             member = "applied_rows" if name == "sec_u" else f"{name}_rows"
             self._rows[name] = self._point(member, np.full((self._room, *shape), 0.0))
@@ -642,9 +642,7 @@ class Engine:
             if e.k == change:
                 self._set_conditions(e.k)
                 e.ready, change = 2, self._system.next_change(e.k)
-            bounded = self._rows or self._arrivals or e.drives or self._noise
-            room = min(length, self._room) if bounded else length
-            e.until = min(e.k + room, clock.steps + 1, change)
+            e.until = min(e.k + length, e.k + self._room, clock.steps + 1, change)
             if stop is not None:
                 e.until = min(e.until, stop)
             every = self._checkpoint_every
