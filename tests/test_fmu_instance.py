@@ -199,6 +199,39 @@ def test_each_call_can_be_followed(path: Path) -> None:
     assert calls[-1] == f"fmi{file.version}FreeInstance"
 
 
+def test_a_thousand_instances_share_one_library(path: Path) -> None:
+    """Some FMUs take thread-local storage with every load, which runs out."""
+    calls: list[str] = []
+    with FmuFile(path, trace=calls.append) as file:
+        instances = [file.instantiate(f"agent {k}") for k in range(1000)]
+        instances[-1].initialise()
+        instances[-1].do_step(0.0, 0.1)
+    assert calls.count("dlopen") == 1
+
+
+@pytest.mark.slow
+def test_many_variables(path: Path, tmp_path: Path) -> None:
+    """200 000 of them are read, and the FMU runs."""
+    with FmuFile(path) as file:
+        version = file.version
+    kind = (
+        ("ScalarVariable", "<Real/></ScalarVariable>")
+        if version == 2
+        else ("Float64", "</Float64>")
+    )
+    more = "".join(
+        f'<{kind[0]} name="more{k}" valueReference="{1000 + k}" causality="local" '
+        f'variability="continuous">{kind[1]}'
+        for k in range(200_000)
+    )
+    old = b"</ModelVariables>"
+    large = described(path, tmp_path / "large.fmu", old, more.encode() + old)
+    with FmuFile(large) as file, file.instantiate("agent") as instance:
+        assert len(file.about.names.by_name) > 200_000
+        instance.initialise()
+        instance.do_step(0.0, 0.1)
+
+
 # ---- models that fail ---------------------------------------------------------------------------
 
 
