@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,23 @@ def test_files_outside_the_folder_need_a_word(place: str, tmp_path: Path) -> Non
         load(path)
     assert place in str(caught.value)
     load(path, outside=True)
+
+
+@pytest.mark.parametrize("cooling", [False, True])
+def test_nothing_outside_is_read_without_the_word(cooling: bool, tmp_path: Path) -> None:
+    """A cooling scenario reads its loads to know what it stands for; a pipe would never end."""
+    os.mkfifo(tmp_path / "endless")
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    text = '[signals.load]\nfile = "../endless"'
+    path = scenario(folder, text)
+    if cooling:
+        path = str(folder / "row.toml")
+        head = '[scenario]\nname = "row"\nuntil = 60.0\nperiod = 5.0\n'
+        network = "[network]\nagents = 2\nring = [1]\npinned = [1]\n"
+        Path(path).write_text(f"{head}[cooling]\n{network}{text}\n")
+    with pytest.raises(ScenarioError, match=r"\$.signals.load.file: .*outside the scenario's"):
+        load(path)
 
 
 def test_a_link_does_not_lead_outside(tmp_path: Path) -> None:

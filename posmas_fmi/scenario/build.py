@@ -21,6 +21,7 @@ from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.expression import Array, VectorFunction, parse
 from posmas_fmi.network import Network, network_from_arcs, read_adjacency
 from posmas_fmi.scenario.faults import make_episodes
+from posmas_fmi.scenario.paths import Named, data_files, leaving
 from posmas_fmi.scenario.reading import read_tables
 from posmas_fmi.scenario.signals import Columns, Signal, Signals, read_signal
 from posmas_fmi.scenario.tables import (
@@ -189,7 +190,8 @@ def load(
     """
     path = find(name_or_path)
     given: dict[str, Any] = {"period": period, "until": until, "seed": seed}
-    tables, text = read_tables(path, {k: v for k, v in given.items() if v is not None})
+    instead = {k: v for k, v in given.items() if v is not None}
+    tables, text = read_tables(path, instead, outside)
     return _Builder(tables, path, text, outside).build()
 
 
@@ -203,7 +205,7 @@ class _Builder:
     def build(self) -> Scenario:
         tables = self.tables
         self.check_name()
-        self.check_paths()
+        self.check_paths()  # before anything is read
         clock = self.attempt(lambda: Clock.of(tables.scenario.until, tables.scenario.period))
         agent = self.attempt(lambda: make_agent(tables.agent))
         if agent is not None and tables.cooling is not None:
@@ -331,16 +333,9 @@ class _Builder:
         """Files must lie in the scenario's folder, unless the caller allows others."""
         if self.outside:
             return
-        folder = self.path.parent.resolve()
-        for place, name in _named_files(self.tables):
-            if not (folder / name).resolve().is_relative_to(folder):
-                self.problems.append(
-                    (
-                        place,
-                        f"{name!r} lies outside the scenario's folder; if you trust the scenario "
-                        "allow that with --outside (load(…, outside=True))",
-                    )
-                )
+        problems = leaving(self.path.parent, _named_files(self.tables))
+        if problems:
+            raise ScenarioError((*self.problems, *problems), str(self.path))
 
     def check_name(self) -> None:
         name = self.tables.scenario.name
@@ -365,19 +360,17 @@ class _Builder:
             self.problems.append(("$.scenario.threads", "expected a whole number >= 1"))
 
 
-def _named_files(tables: ScenarioFile) -> list[tuple[str, str]]:
+def _named_files(tables: ScenarioFile) -> list[Named]:
     """Every file that a scenario names, with its place; also names that may be shipped FMUs."""
     controls = {"$.control.python": tables.control.python}
     controls |= {f"$.controllers.{n}.python": c.python for n, c in tables.controllers.items()}
-    named: list[tuple[str, str | None]] = [
-        ("$.network.file", tables.network.file),
+    return [
+        *data_files(tables.network, tables.signals),
         ("$.plant.fmu", tables.plant.fmu),
-        *((f"$.signals.{name}.file", signal.file) for name, signal in tables.signals.items()),
         *((f"$.plant.override[{k}].fmu", o.fmu) for k, o in enumerate(tables.plant.override)),
         *((f"$.component[{k}].fmu", c.fmu) for k, c in enumerate(tables.component)),
         *((place, text and text.rpartition(":")[0]) for place, text in controls.items()),
     ]
-    return [(place, name) for place, name in named if name]
 
 
 def _columns(signals: dict[str, Signal], tables: dict[str, SignalTable]) -> dict[str, Columns]:

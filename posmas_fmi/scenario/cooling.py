@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.cooling.classes import class_limit, dew_point
+from posmas_fmi.cooling.classes import ZERO_CELSIUS, class_limit, dew_point
 from posmas_fmi.cooling.control import CONTROLLERS, WHAT_IS_PROVED, Control, controller, mean_delays
 from posmas_fmi.cooling.figures import facts, kpi_table, limits, verdicts
 from posmas_fmi.cooling.kpi import key_figures
@@ -43,6 +44,8 @@ NOMINAL = LineParameters()
 PREDICTIVE = "mpc"
 FACILITY = "facility"
 HELD_ABOVE_DEW_POINT = 2.0  # K
+FACILITY_RANGE = (273.15, 363.15)  # K, of water that cools
+WET_BULB_RANGE = (213.15, 333.15)  # K, of weather
 SMALL_LOAD = 0.01  # of the nominal load: below it a unit is wrong
 RECORDED = (
     "supply_temperature",
@@ -127,7 +130,8 @@ def expand(
     )
     _check_load(load, signals[cooling.load], float(size.max()), f"$.signals.{cooling.load}")
     first = np.broadcast_to(load.at(np.zeros(1))[0], (n,))
-    values = [_start(cooling, float(s), float(p)) for s, p in zip(size, first, strict=True)]
+    with at(f"$.signals.{cooling.load}"):
+        values = [_start(cooling, float(s), float(p)) for s, p in zip(size, first, strict=True)]
     common = values[0]
     start = [[v["T_plate"], v["T_return"], v["T_supply"]] for v in values]
     above = (np.array(start) - cooling.facility).tolist()
@@ -171,7 +175,9 @@ def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
                 f"there is no signal {name!r}: write [signals.{name}]", f"$.cooling.{key}"
             )
     if cooling.water_class is not None:
-        class_limit(cooling.water_class)
+        with at("$.cooling.water_class"):
+            class_limit(cooling.water_class)
+    _check_temperatures(cooling)
     if cooling.band <= 0:
         raise InputError(f"expected a number > 0 (got {cooling.band:g})", "$.cooling.band")
     for key in ("noise", "resolution", "shortage", "chiller"):
@@ -179,6 +185,41 @@ def _check(cooling: CoolingTable, signals: Mapping[str, SignalTable]) -> None:
             raise InputError(
                 f"expected a number >= 0 (got {getattr(cooling, key):g})", f"$.cooling.{key}"
             )
+
+
+def _check_temperatures(cooling: CoolingTable) -> None:
+    """Temperatures are kelvin; set-points are kelvin above the facility supply."""
+    for key, (low, high) in (("facility", FACILITY_RANGE), ("wet_bulb", WET_BULB_RANGE)):
+        value = getattr(cooling, key)
+        if not isinstance(value, str) and not low <= value <= high:
+            raise InputError(
+                f"expected a temperature of {low:g} to {high:g} K (got {value:g}); "
+                f"{ZERO_CELSIUS:g} K is 0 °C",
+                f"$.cooling.{key}",
+            )
+    step = cooling.set_point_step
+    later = None if step is None else step.to
+    wanted = {"set_point": cooling.set_point, "set_point_step.to": later}
+    for key, above in wanted.items():
+        if above is not None and not above > 0:
+            raise InputError(
+                f"expected kelvin above the facility supply, more than 0 (got {above:g}): coolant "
+                "is never colder than the water that cools it",
+                f"$.cooling.{key}",
+            )
+    if step is not None and step.at < 0:
+        raise InputError(f"expected seconds >= 0 (got {step.at:g})", "$.cooling.set_point_step.at")
+    with at("$.cooling.air", below=True):
+        floor(cooling)
+
+
+@contextmanager
+def at(place: str, below: bool = False) -> Iterator[None]:
+    """Name the place in the scenario that a value comes from, or that which it lies below."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.message, f"{place}.{error.where}" if below else place) from None
 
 
 def _check_load(load: Signal, table: SignalTable, size: float, place: str) -> None:

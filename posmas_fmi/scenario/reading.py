@@ -22,6 +22,7 @@ from cattrs.errors import (
 
 from posmas_fmi.design import DesignSettings
 from posmas_fmi.errors import InputError, PosmasError, ScenarioError
+from posmas_fmi.scenario.paths import data_files, leaving
 from posmas_fmi.scenario.tables import (
     CoolingTable,
     Count,
@@ -36,7 +37,9 @@ from posmas_fmi.scenario.tables import (
 LARGEST_FILE = 50_000_000  # bytes
 
 
-def read_tables(path: Path, instead: dict[str, Any] | None = None) -> tuple[ScenarioFile, str]:
+def read_tables(
+    path: Path, instead: dict[str, Any] | None = None, outside: bool = False
+) -> tuple[ScenarioFile, str]:
     """Read a scenario file.
 
     Parameters
@@ -44,6 +47,8 @@ def read_tables(path: Path, instead: dict[str, Any] | None = None) -> tuple[Scen
     path : Path
     instead : dict, optional
         Values of ``[scenario]`` that take the place of the file's.
+    outside : bool
+        Whether files outside its folder may be read for ``[cooling]``.
 
     Returns
     -------
@@ -74,7 +79,7 @@ def read_tables(path: Path, instead: dict[str, Any] | None = None) -> tuple[Scen
         head |= instead or {}
     converter = _converter()
     if "cooling" in document:
-        document = _expand(document, converter, path)
+        document = _expand(document, converter, path, outside)
     problems = _design_problems(document.get("design"))
     try:
         tables = converter.structure(document, ScenarioFile)
@@ -85,7 +90,9 @@ def read_tables(path: Path, instead: dict[str, Any] | None = None) -> tuple[Scen
     return tables, text
 
 
-def _expand(document: dict[str, Any], converter: cattrs.Converter, path: Path) -> dict[str, Any]:
+def _expand(
+    document: dict[str, Any], converter: cattrs.Converter, path: Path, outside: bool
+) -> dict[str, Any]:
     """Put the tables that ``[cooling]`` stands for beside those that are written."""
     from posmas_fmi.scenario.cooling import expand
 
@@ -101,6 +108,8 @@ def _expand(document: dict[str, Any], converter: cattrs.Converter, path: Path) -
             parts[name] = converter.structure(document.get(name, {}), kind)
         except (ClassValidationError, IterableValidationError) as error:
             problems += _problems(error, f"$.{name}")
+    if not problems and not outside:  # the signals are read here
+        problems = leaving(path.parent, data_files(parts["network"], parts["signals"]))
     if problems:
         raise ScenarioError(tuple(problems), str(path))
     try:
