@@ -20,6 +20,8 @@ MAX_PARENTHESES = 64
 MAX_DEPTH = 200  # of the syntax tree: a sum of n terms is n deep
 MAX_NODES = 2000
 MAX_EXPONENT = 64
+MAX_CHOICES = 20  # of one min or max: its slope takes the cube of them
+MAX_EXPANDED = 5000  # terms when all is multiplied out
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -102,7 +104,14 @@ def parse(text: str, variables: Sequence[str], where: str = "") -> sympy.Expr:
     if sum(1 for _ in ast.walk(tree)) > MAX_NODES:
         raise ExpressionError(f"expected at most {MAX_NODES} terms; split the expression", where)
     try:
-        return _Builder(tuple(variables), text, where).build(tree.body, 0)
+        made = _Builder(tuple(variables), text, where).build(tree.body, 0)
+        if _expanded(made) > MAX_EXPANDED:
+            raise ExpressionError(
+                f"multiplied out it has more than {MAX_EXPANDED} terms; take lower powers of "
+                f"sums; in {_shorten(text)!r}",
+                where,
+            )
+        return made
     except (MemoryError, RecursionError, ArithmeticError, TypeError, ValueError) as error:
         reason = f"it cannot be worked out ({type(error).__name__})"
         raise ExpressionError(f"cannot read {_shorten(text)!r}: {reason}", where) from error
@@ -114,6 +123,21 @@ def _nesting(text: str) -> int:
         depth += (character in "([{") - (character in ")]}")
         deepest = max(deepest, depth)
     return deepest
+
+
+def _expanded(expr: sympy.Expr) -> int:
+    """Bound on the number of terms after `sympy.expand`, of the expression or a part of it."""
+    if not expr.args:
+        return 1
+    inside = [_expanded(arg) for arg in expr.args]
+    if expr.is_Add:
+        return sum(inside)
+    if expr.is_Mul:
+        return max(inside) if max(inside) > MAX_EXPANDED else math.prod(inside)
+    if expr.is_Pow and expr.exp.is_Rational and 1 < inside[0] <= MAX_EXPANDED:
+        power = math.ceil(abs(expr.exp))
+        return math.comb(inside[0] + power - 1, power)
+    return max(inside)
 
 
 def _shorten(text: str, length: int = 60) -> str:
@@ -201,7 +225,10 @@ class _Builder:
         if len(args) != count and not (count == -1 and len(args) >= 2):
             wanted = "two or more" if count == -1 else str(count)
             raise self.refuse(f"{name} takes {wanted} argument(s) (got {len(args)})")
-        return make(*(self.build(arg, depth + 1) for arg in args))
+        made = make(*(self.build(arg, depth + 1) for arg in args))
+        if isinstance(made, sympy.Min | sympy.Max) and len(made.args) > MAX_CHOICES:
+            raise self.refuse(f"expected at most {MAX_CHOICES} arguments of one {name}")
+        return made
 
     def finite(self, expr: sympy.Expr) -> sympy.Expr:
         if expr.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo):

@@ -17,6 +17,8 @@ import scipy.sparse.linalg as spla
 from posmas_fmi.errors import NetworkError
 from posmas_fmi.expression import Array
 
+LARGEST = 1_000_000  # agents
+LARGEST_FILE = 1_000_000_000  # bytes
 DENSE_LIMIT = 2000  # agents up to which dense O(N³) algorithms are used
 DIRECT_LIMIT = 300  # agents up to which a sparse factorisation is never too expensive
 
@@ -334,6 +336,7 @@ def network_from_arcs(
     """
     if agents < 1:
         raise NetworkError(f"expected at least one agent (got {agents})", "$.network.agents")
+    _check_size(agents, "$.network.agents")
     table = np.ones((len(arcs), 3))
     for k, arc in enumerate(arcs):
         if len(arc) not in (2, 3):
@@ -354,6 +357,12 @@ def network_from_arcs(
     row, column = table[:, 1].astype(int) - 1, table[:, 0].astype(int) - 1
     adjacency = sp.csr_array((table[:, 2], (row, column)), shape=(agents, agents))
     return Network(adjacency, d, tuple(names))
+
+
+def _check_size(agents: int, where: str) -> None:
+    """Before anything is made that is as long."""
+    if agents > LARGEST:
+        raise NetworkError(f"expected at most {LARGEST} agents (got {str(agents)[:20]})", where)
 
 
 def _check_arcs(table: Array, agents: int) -> None:
@@ -407,6 +416,10 @@ def read_adjacency(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
             f"expected a .csv, .mtx or .graphml file (got {path.name})", "$.network.file"
         )
     try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise NetworkError(
+                f"{path.name} is larger than {LARGEST_FILE:g} bytes", "$.network.file"
+            )
         return reader(path)
     except NetworkError:
         raise
@@ -441,6 +454,8 @@ def _from_named_arcs(
 ) -> tuple[sp.csr_array, tuple[str, ...]]:
     found = dict.fromkeys(end for a, b, _ in arcs for end in (a, b))
     numeric = all(name.isdecimal() for name in found)
+    if numeric:
+        _check_size(max((int(n) for n in found), default=0), "$.network.file")
     # numbers are agent numbers from 1: agents without an arc in between exist as well
     names = (
         tuple(str(k + 1) for k in range(max((int(n) for n in found), default=0)))
@@ -460,6 +475,10 @@ def _from_named_arcs(
 def _read_matrix_market(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
     import scipy.io
 
+    rows, columns, entries, form, *_ = scipy.io.mminfo(path)
+    _check_size(max(rows, columns), "$.network.file")
+    if (rows * columns if form == "array" else entries) > path.stat().st_size:
+        raise NetworkError(f"{path.name} has fewer numbers than it says", "$.network.file")
     matrix = sp.csr_array(scipy.io.mmread(path))
     return matrix, tuple(str(k + 1) for k in range(matrix.shape[0]))
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from fuzz.readers import READERS, beginnings
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from posmas_fmi.errors import InputError, NetworkError
+from posmas_fmi.network import read_adjacency
+from posmas_fmi.scenario import load
 
 WORDS = [
     *("x1", "x2", "t", "u1", "x9", "sin", "exp", "sqrt", "log", "min", "clip", "abs", "sign"),
@@ -74,6 +79,50 @@ def test_a_run_that_would_never_end_is_refused() -> None:
     good = beginnings("scenario")[0]
     READERS["scenario"](good.replace(b"until = 10.0", b"until = 1e308"))
     READERS["scenario"](good.replace(b"period = 0.005", b"period = 1e308"))
+
+
+TOO_LARGE = {
+    "agents": ("agents = 4", "agents = 1000000000", "at most 1000000 agents"),
+    "digits": ("seed = 1", "seed = " + "9" * 5000, "not TOML"),
+    "long key": ("phi = 10.0", "phi" + ".a" * 20_000 + " = 1", "nested too deeply"),
+    "key in keys": ("phi = 10.0", "phi = " + "{a.b.c = " * 40 + "1" + "}" * 40, "too deeply"),
+    "arrays": ("phi = 10.0", "phi = " + "[" * 300 + "]" * 300, "nested too deeply"),
+    "power of a sum": ("x1*sin(0.31*x1*t)", "((x1 + x2 + 1)**64)**64", "more than 5000 terms"),
+    "product of sums": ("x1*sin(0.31*x1*t)", "(x1 + x2)*(x1 + t)**60*(x2 + t)**60*t", "5000 terms"),
+    "choices": (
+        "x1*sin(0.31*x1*t)",
+        "min(" + ", ".join(f"x1 + {k}*x2" for k in range(40)) + ")",
+        "at most 20 arguments",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TOO_LARGE)
+def test_small_scenarios_of_much_work_are_refused(name: str, tmp_path: Path) -> None:
+    """Each took minutes, gigabytes or ended with a traceback."""
+    good, bad, message = TOO_LARGE[name]
+    text = beginnings("scenario")[0].decode()
+    assert good in text
+    path = tmp_path / "large.toml"
+    path.write_text(text.replace(good, bad))
+    with pytest.raises(InputError, match=message):
+        load(path)
+
+
+NETWORKS = {
+    "far.csv": "from,to\n1,2\n2,99999999999\n",
+    "far.mtx": "%%MatrixMarket matrix coordinate real general\n3000000000 3000000000 1\n1 2 1.0\n",
+    "short.mtx": "%%MatrixMarket matrix array real general\n900000 900000\n1.0\n",
+    "few.mtx": "%%MatrixMarket matrix coordinate real general\n9 9 999999999999\n1 2 1.0\n",
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_small_files_of_huge_networks_are_refused(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text(NETWORKS[name])
+    with pytest.raises(NetworkError, match=r"at most 1000000 agents|fewer numbers than it says"):
+        read_adjacency(path)
 
 
 @settings(max_examples=100)

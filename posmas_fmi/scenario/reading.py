@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 import types
 import typing
@@ -35,6 +36,9 @@ from posmas_fmi.scenario.tables import (
 )
 
 LARGEST_FILE = 50_000_000  # bytes
+DEEPEST = 32  # tables and arrays inside each other
+_WORD = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_WORD}(?:[ \t]*+\.[ \t]*+{_WORD}){{{DEEPEST}}}")
 
 
 def read_tables(
@@ -64,12 +68,17 @@ def read_tables(
         Naming every key that is missing, unknown or of the wrong type.
     """
     text = _read_text(path)
+    deep = InputError("the file is nested too deeply to be a scenario", str(path))
+    if _LONG_KEY.search(text):  # reading a.a.a.… takes the square of its length
+        raise deep
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # also of numbers with thousands of digits
         raise InputError(f"this is not TOML: {error}", str(path)) from None
     except RecursionError:
-        raise InputError("the file is nested too deeply to be a scenario", str(path)) from None
+        raise deep from None
+    if _depth_exceeds(document, DEEPEST):
+        raise deep
     if not document:
         raise InputError(
             "the file is empty; start from a shipped scenario, see 'posmas-fmi models'", str(path)
@@ -117,6 +126,21 @@ def _expand(
     except PosmasError as error:
         raise ScenarioError(tuple(error.problems), str(path)) from None
     return merged(more, document)
+
+
+def _depth_exceeds(value: Any, most: int) -> bool:
+    """Whether tables and arrays lie more than so deep inside each other."""
+    level = [value]
+    for _ in range(most + 1):
+        level = [
+            entry
+            for whole in level
+            for entry in (whole.values() if isinstance(whole, dict) else whole)
+            if isinstance(entry, dict | list)
+        ]
+        if not level:
+            return False
+    return True
 
 
 def _integral(design: Any) -> bool:
