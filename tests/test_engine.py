@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import attrs
 import numpy as np
@@ -20,6 +20,7 @@ from posmas_fmi.cosim import engine, native
 from posmas_fmi.cosim.channel import Arrivals, Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
+from posmas_fmi.cosim.functions import Functions
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.errors import BuildError, FmuCallError, InputError
@@ -117,8 +118,9 @@ class Case:
 
 
 def run(
-    case: Case, cache: Path, which: engine.Wanted, threads: int = 1
+    case: Case, cache: Path, which: engine.Wanted | Literal["numpy alone"], threads: int = 1
 ) -> tuple[Outcome, dict[str, np.ndarray]]:
+    """Run a case; the numpy loop takes g and sec from the engine's library, or is alone."""
     system, rows = case.system(), {}
 
     def record(times: np.ndarray, values: dict[str, np.ndarray]) -> None:
@@ -126,7 +128,8 @@ def run(
             rows.setdefault(name, []).append(value.copy())
 
     with case.plant(cache) as plant:
-        choice = engine.choose(system.law, which)
+        alone = which == "numpy alone"
+        choice = engine.Choice("numpy") if alone else engine.choose(system.law, which)
         outcome = engine.run(system, plant, record, choice=choice, threads=threads)
     return outcome, {name: np.concatenate(blocks) for name, blocks in rows.items()}
 
@@ -174,9 +177,56 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_engine_agrees_with_the_numpy_loop(name: str, cache: Path) -> None:
-    expected = run(CASES[name], cache, "numpy")
+    expected = run(CASES[name], cache, "numpy alone")
     assert expected[0].ended == ("diverged" if "diverges" in name else "complete")
-    assert_alike(run(CASES[name], cache, "c"), expected)
+    for which in ("c", "numpy"):
+        assert_alike(run(CASES[name], cache, which), expected)
+
+
+@pytest.mark.parametrize("example", [example_1(), wide()], ids=["example 1", "other sizes"])
+def test_compiled_functions_of_any_number_of_agents(example: Example) -> None:
+    agent = agent_of(example)
+    law = ProtocolLaw(agent, make_protocol(digraph(2), *GAINS[agent.m], 1.0))
+    library = native.load(engine.choose(law, "c").library)
+    expected, compiled = law.functions, law.with_functions(library).functions
+    random = np.random.default_rng(5)
+    X, U = random.uniform(0, 2, (agent.m, 19)), random.uniform(-3, 3, (agent.p, 19))
+    X[0, 4] = 1e8  # beyond the reduction of sin
+    wanted = np.empty_like(X)
+    expected.g(0.7, X, wanted)
+    every = np.empty_like(X)
+    compiled.g(0.7, X, every)
+    for n in range(1, 20):  # whole groups of lanes, and what is left
+        some = np.full((2 * agent.m, n), np.nan)
+        some[: agent.m] = X[:, :n]
+        compiled.g(0.7, some[: agent.m], some[agent.m :])
+        np.testing.assert_allclose(some[agent.m :], wanted[:, :n], rtol=1e-14, atol=1e-14)
+        np.testing.assert_array_equal(some[agent.m :], every[:, :n])
+        given = np.ascontiguousarray(U[:, :n])
+        np.testing.assert_allclose(compiled.sec(given), expected.sec(U[:, :n]), rtol=1e-14)
+    with pytest.raises(TypeError, match="contiguous"):
+        compiled.sec(U[:, ::2])
+
+
+def test_the_numpy_loop_says_where_its_functions_are_from(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[Any] = []
+    original = Functions.compiled
+    monkeypatch.setattr(
+        Functions, "compiled", lambda *given: taken.append(given) or original(*given)
+    )
+    case = Case(until=0.05)
+    choice = engine.choose(case.system().law, "numpy")
+    facts = choice.to_dict()
+    assert (facts["used"], facts["functions"]) == ("numpy", "c")
+    run(case, cache, "numpy alone")
+    assert not taken
+    assert engine.Choice("numpy").to_dict()["functions"] == "numpy"
+    run(case, cache, "numpy")
+    assert len(taken) == 1
+    # what needs the numpy loop has them as well
+    assert engine.choose(case.system().law, "auto", "it is coupled otherwise").library
 
 
 def test_both_see_example_1_diverge(cache: Path) -> None:
@@ -448,14 +498,18 @@ def test_fmus_called_one_by_one_give_the_same(cache: Path, monkeypatch: pytest.M
         Fragile(values={2: [0.495, NEVER]}),
         Fragile(values={1: [NEVER, 0.495]}, fmi=2),
     ]
-    expected = [run(case, cache, "numpy") for case in cases]
+    expected = [run(case, cache, "numpy alone") for case in cases]
 
     def no_compiler(*_: object) -> Path:
         raise BuildError("found no C compiler")
 
     monkeypatch.setattr(native, "library", no_compiler)
     choice = engine.choose(cases[0].system().law)
-    assert choice.to_dict() == {"used": "numpy", "reason": "found no C compiler"}
+    assert choice.to_dict() == {
+        "used": "numpy",
+        "functions": "numpy",
+        "reason": "found no C compiler",
+    }
     with pytest.raises(BuildError):
         engine.choose(cases[0].system().law, "c")
     for case, wanted in zip(cases, expected, strict=True):

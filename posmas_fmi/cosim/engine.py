@@ -17,7 +17,7 @@ from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.fmus import READING, Incident, Report
-from posmas_fmi.cosim.law import CompiledLaw, Law, Weights
+from posmas_fmi.cosim.law import CompiledLaw, Law, ProtocolLaw, Weights
 from posmas_fmi.cosim.master import (
     DIVERGED,
     Outcome,
@@ -58,7 +58,7 @@ class Choice:
     reason : str
         Why not C, where it is not.
     library : Path or None
-        The engine's.
+        The engine's. The numpy loop takes g and sec from it, where there is one.
     """
 
     engine: Literal["c", "numpy"]
@@ -68,6 +68,8 @@ class Choice:
     def to_dict(self) -> dict[str, str]:
         """Return what a manifest says about it."""
         facts: dict[str, str] = {"used": self.engine}
+        if self.engine == "numpy":
+            facts["functions"] = "numpy" if self.library is None else "c"  # g and sec
         if self.library is not None:
             facts["library"] = self.library.name  # the name holds a hash of its sources
         return facts | ({"reason": self.reason} if self.reason else {})
@@ -101,31 +103,37 @@ def choose(law: Law, wanted: Wanted = "auto", unfit: str = "") -> Choice:
     >>> choose(ProtocolLaw(linear_agent([[-1.0]], [[1.0]], [[1.0]]), protocol), "numpy").engine
     'numpy'
     """
-    if wanted == "numpy":
-        return Choice("numpy", "chosen in the scenario")
-    reason = unfit
-    if not reason and not isinstance(law, CompiledLaw):
-        reason = "the controllers are Python functions; the engine needs them in C"
+    if wanted == "c" and unfit:
+        raise InputError(unfit, "$.scenario.engine")
+    reason = "chosen in the scenario" if wanted == "numpy" else unfit
+    path: Path | None = None
     try:
-        if reason:
-            raise InputError(reason, "$.scenario.engine")
-        assert isinstance(law, CompiledLaw)
-        path = native.library(law.sources())
-        native.load(path)
-    except InputError as error:
+        if not reason or isinstance(law, ProtocolLaw):
+            path = _compiled(law)
+    except (InputError, BuildError) as error:
         if wanted == "c":
             raise
-        return _fall_back(error.message)
-    except BuildError as error:
-        if wanted == "c":
-            raise
-        return _fall_back(str(error))
-    return Choice("c", library=path)
+        reason = reason or (error.message if isinstance(error, InputError) else str(error))
+    if not reason:
+        return Choice("c", library=path)
+    if wanted != "numpy":
+        _warn(reason)
+    return Choice("numpy", reason, path)
 
 
-def _fall_back(reason: str) -> Choice:
+def _compiled(law: Law) -> Path:
+    if not isinstance(law, CompiledLaw):
+        raise InputError(
+            "the controllers are Python functions; the engine needs them in C",
+            "$.scenario.engine",
+        )
+    path = native.library(law.sources())
+    native.load(path)
+    return path
+
+
+def _warn(reason: str) -> None:
     log.warning("running with numpy instead of the engine: %s", reason)
-    return Choice("numpy", reason)
 
 
 def run(
@@ -166,9 +174,17 @@ def run(
     """
     choice = choice or choose(system.law, unfit=unfit(system))
     if choice.engine == "c" and not isinstance(plant, FmuPlant):
-        choice = _fall_back(f"the engine steps FMUs (the plant is a {type(plant).__name__})")
+        choice = Choice(
+            "numpy",
+            f"the engine steps FMUs (the plant is a {type(plant).__name__})",
+            choice.library,
+        )
+        _warn(choice.reason)
     if choice.engine == "numpy":
         begin = snapshots.start.k if snapshots is not None and snapshots.start else 0
+        if choice.library is not None and isinstance(system.law, ProtocolLaw):
+            law = system.law.with_functions(native.load(choice.library))
+            system = attrs.evolve(system, law=law)
         return simulate(
             system,
             plant,

@@ -12,6 +12,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim.failure import Action, Failure
+from posmas_fmi.cosim.loading import address
 from posmas_fmi.cosim.served import Served, needs_python
 from posmas_fmi.errors import FmuCallError, FmuEndedError, FmuError
 from posmas_fmi.fmu.instance import FmuFile, FmuInstance
@@ -573,13 +574,13 @@ class FmuLoop:
         report = Report()
         self._step(
             self._fmus.address,
-            which.ctypes.data,
+            address(which),
             len(which),
-            t.ctypes.data,
-            h.ctypes.data,
-            inputs.ctypes.data,
-            readings.ctypes.data,
-            self._scratch.ctypes.data,
+            address(t),
+            address(h),
+            address(inputs),
+            address(readings),
+            address(self._scratch),
             ctypes.addressof(report),
             self._incidents,
         )
@@ -609,10 +610,10 @@ class FmuLoop:
         report = Report()
         self._read(
             self._fmus.address,
-            which.ctypes.data,
+            address(which),
             len(which),
-            readings.ctypes.data,
-            self._scratch.ctypes.data,
+            address(readings),
+            address(self._scratch),
             ctypes.addressof(report),
             self._incidents,
         )

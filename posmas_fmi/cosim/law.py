@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from copy import copy
+from ctypes import CDLL
 from typing import TYPE_CHECKING
 from typing import Protocol as Interface
 
@@ -11,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from posmas_fmi.agent import Agent
+from posmas_fmi.cosim.functions import Functions
 from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array, VectorFunction
@@ -259,6 +262,11 @@ class ProtocolLaw(CompiledLaw):
         The model that observers and leader compute with.
     protocol : Protocol
 
+    Attributes
+    ----------
+    functions : Functions
+        How g and sec of the agent are evaluated: with numpy, unless `with_functions` was asked.
+
     Examples
     --------
     >>> from posmas_fmi.agent import linear_agent
@@ -275,14 +283,21 @@ class ProtocolLaw(CompiledLaw):
 
     def __init__(self, agent: Agent, protocol: Protocol) -> None:
         self.agent, self.protocol = agent, protocol
+        self.functions = Functions.of(agent)
         self.weights = Weights.of(protocol, innovation=agent.q)
         self._steps: dict[float, Propagator] = {}
 
     def propagator(self, h: float) -> Propagator:
         """Return the sampled propagation of the model over h [s]."""
         if h not in self._steps:
-            self._steps[h] = Propagator.of(self.agent, h)
+            self._steps[h] = Propagator.of(self.agent, h, self.functions.g)
         return self._steps[h]
+
+    def with_functions(self, library: CDLL) -> ProtocolLaw:
+        """Return this law with g and sec in C, from the library of its `sources`."""
+        law = copy(self)
+        law.functions, law._steps = Functions.compiled(library), {}
+        return law
 
     def sources(self) -> Sources:
         """Return the sources of the engine; g and sec must be expressions."""
@@ -341,13 +356,13 @@ class ProtocolLaw(CompiledLaw):
         states, held = known[:m], known[m : 2 * m]
         disagreement = weights.disagreement(sent, heard).T
         u = np.dot(self.protocol.K, disagreement[:m])
-        applied = self.agent.sec_numpy(u.T)
+        applied = self.functions.sec(u)
         states[:, :N], states[:, N] = memory.T, leader
         held[:, :N] = np.dot(self.protocol.E, disagreement[m:])
-        held[:, :N] += np.dot(agent.B, applied.T)
+        held[:, :N] += np.dot(agent.B, applied)
         held[:, N] = 0.0
         after = propagator.advance(t, known).T
-        return Decision(u.T, applied, after[:N], after[N])
+        return Decision(u.T, applied.T, after[:N], after[N])
 
     def leader_message(self, memory: Array) -> Array:
         """Return the state, and no innovation."""

@@ -432,7 +432,9 @@ class Run:
             t = clock.time(k)
             self._change_conditions(k)
             self._measure(k, begins)
-            sent = rounded(system.law.send(state.memory, state.measured), system.channel.resolution)
+            sent = system.law.send(state.memory, state.measured)
+            if system.channel.resolution:
+                sent = rounded(sent, system.channel.resolution)
             heard = self._exchange(k, sent)
             self._control(t, k, sent, heard)
             self._observe(t)
@@ -690,9 +692,8 @@ class Run:
             scale = max(np.abs(truth).max(), np.abs(s).max(), np.abs(xhat).max(), 1.0)
             self.limit = DIVERGED * float(scale)
         lowest = reduce(np.minimum, truth.T)
-        falls = lowest < self.min_state
-        np.copyto(self.min_state, lowest, where=falls)
-        np.copyto(self.min_time, t, where=falls)
+        np.putmask(self.min_time, lowest < self.min_state, t)
+        np.fmin(self.min_state, lowest, out=self.min_state)  # NaN is no smaller
         if not (_is_within(truth, self.limit) and _is_within(xhat, self.limit)):
             self._diverged(t, np.maximum(_largest(truth), _largest(xhat)))
 

@@ -1,24 +1,51 @@
 /* For any processor: SSE2 and NEON have two lanes. Here too it is chosen which one is used. */
 #define LANES 2
 #define GROUPS 2
-#define BLOCK_FUNCTION controller_block_2
 #include "block.h"
+#include "export.h"
 
 typedef void Block(const Controller *, int, double, const double *, const double *, const double *,
                    double *, double *, double *);
+typedef void G(double, const double *, double *, int64_t);
+typedef void Sec(const double *, double *, int64_t);
 Block controller_block_4, controller_block_8;
+G columns_g_4, columns_g_8;
+Sec columns_sec_4, columns_sec_8;
+
+static int lanes_here(void)
+{
+#if defined __x86_64__
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
+        return 8;
+    if (__builtin_cpu_supports("avx2"))
+        return 4;
+#endif
+    return 2;
+}
+
+#if defined __x86_64__
+#define CHOOSE(name) (lanes == 8 ? name##_8 : lanes == 4 ? name##_4 : name##_2)
+#else
+#define CHOOSE(name) ((void)lanes, name##_2)
+#endif
 
 void controller_block(const Controller *c, int agents, double t, const double *driven,
                       const double *disagreement, const double *memory, double *next, double *u,
                       double *applied)
 {
-    Block *block = controller_block_2;
-#if defined __x86_64__
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl"))
-        block = controller_block_8;
-    else if (__builtin_cpu_supports("avx2"))
-        block = controller_block_4;
-#endif
-    block(c, agents, t, driven, disagreement, memory, next, u, applied);
+    const int lanes = lanes_here();
+    CHOOSE(controller_block)(c, agents, t, driven, disagreement, memory, next, u, applied);
+}
+
+EXPORT void agent_columns_g(double t, const double *x, double *g, int64_t n)
+{
+    const int lanes = lanes_here();
+    CHOOSE(columns_g)(t, x, g, n);
+}
+
+EXPORT void agent_columns_sec(const double *u, double *sec, int64_t n)
+{
+    const int lanes = lanes_here();
+    CHOOSE(columns_sec)(u, sec, n);
 }

@@ -8,7 +8,6 @@
 
 #define LANES 4
 #define GROUPS 2
-#define BLOCK_FUNCTION controller_block_4
 #include "block.h"
 
 #if defined __clang__

@@ -8,7 +8,6 @@
 
 #define LANES 8
 #define GROUPS 2
-#define BLOCK_FUNCTION controller_block_8
 #include "block.h"
 
 #if defined __clang__

@@ -13,6 +13,8 @@
 #ifndef CONTROLLER_H
 #define CONTROLLER_H
 
+#include <stdint.h>
+
 #include "agent_functions.h"
 
 enum {
@@ -61,6 +63,11 @@ void controller_step(const Controller *c, const double *own, double t, const dou
 void controller_block(const Controller *c, int agents, double t, const double *driven,
                       const double *disagreement, const double *memory, double *next, double *u,
                       double *applied);
+
+/* g (M, n) at the states x (M, n), and sec (P, n) of the inputs u (P, n): a column each. For a loop
+ * that is not in C; block_2.c exports them. */
+void agent_columns_g(double t, const double *x, double *g, int64_t n);
+void agent_columns_sec(const double *u, double *sec, int64_t n);
 
 /* The leader: its memory (MEMORY) at t + h, and what it sends (MESSAGE). */
 void controller_leader(const Controller *c, double t, const double *memory, double *next);
