@@ -573,9 +573,8 @@ PEERS: dict[str, Callable[[Setting], Cost]] = {
     "fmpy.ssp": lambda setting: fmpy_ssp(setting, False),
     "FMPy loop": fmpy_loop,
 }
-EQUAL: dict[
-    str, Callable[[Setting], Cost]
-] = {  # the same closed loop, with controllers and all connections
+# the same closed loop, with controllers and all connections
+EQUAL: dict[str, Callable[[Setting], Cost]] = {
     "libcosimpy, equal": lambda setting: stepwise(peers.libcosim, setting, True),
     "ecospy, equal": lambda setting: stepwise(peers.ecos, setting, True),
     "fmpy.ssp, equal": lambda setting: fmpy_ssp(setting, True),
