@@ -35,7 +35,7 @@ typedef struct {
 enum {
     NOTHING, SEGFAULT, ABORT, EXIT, HANG, ERROR, FATAL, DISCARD, OUTSIDE, NOT_A_NUMBER, STACK,
     MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES,
-    CHANGES
+    CHANGES, OPENS, FILLS, DAEMON
 };
 
 static int instances;
@@ -56,6 +56,34 @@ static void fill_memory(void)
         memset(block, 1, 1 << 24);
         usleep(2000);
     }
+}
+
+/* Files without end in the folder for temporary ones. */
+static void fill_folder(void)
+{
+    static char block[1 << 20];
+    const char *folder = getenv("TMPDIR");
+    for (int k = 0;; k++) {
+        char path[4096];
+        snprintf(path, sizeof path, "%s/fill%d", folder ? folder : ".", k);
+        FILE *file = fopen(path, "w");
+        if (file) {
+            fwrite(block, 1, sizeof block, file);
+            fclose(file);
+        }
+        usleep(2000);
+    }
+}
+
+/* A process in a session of its own that goes on for minutes. */
+static void leave_daemon(void)
+{
+    if (fork())
+        return;
+    setsid();
+    if (!fork())
+        sleep(300);
+    _exit(0);
 }
 
 static int go_wrong(Plant *p)
@@ -101,6 +129,16 @@ static int go_wrong(Plant *p)
     case CLOSES:
         for (int k = 3; k < 256; k++)
             close(k);
+        break;
+    case OPENS:
+        for (;;)
+            if (open("/dev/null", O_RDONLY) < 0)
+                usleep(1000);
+    case FILLS:
+        fill_folder();
+        break;
+    case DAEMON:
+        leave_daemon();
         break;
     case CHANGES: /* what it shares with the others in its process */
         fesetround(FE_UPWARD);

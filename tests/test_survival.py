@@ -14,7 +14,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,8 @@ VERDICTS = {
     "not a number": "x is not finite (nan)",
     "stack": "ended by signal 11 (SIGSEGV)",
     "memory": "used more memory than it may",
+    "opens": "opened more files than it may",
+    "fills": "wrote more to its folder for temporary files than it may",
     "output": "wrote more output than it may",
 }
 
@@ -59,7 +61,7 @@ def isolation(on_failure: Any = "stop", patience: float = 20.0, **options: Any) 
         "process",
         **{"workers": 1, **options},
         on_failure=on_failure,
-        limits=Limits(memory=0.3, output=8),
+        limits=Limits(memory=0.3, output=8, files=2**-5),
         patience=Patience(step=patience, start=20.0),
     )
 
@@ -188,6 +190,15 @@ def test_an_fmu_that_crashes_when_freed_harms_nobody(fmu: Path) -> None:
     assert {i.agent for i in outcome.incidents} == {"2"}
     assert outcome.ended == "complete"
     assert (np.diff(x[:, 2]) != 0).all()
+
+
+def test_processes_that_an_fmu_leaves_behind_are_ended(
+    fmu: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    outcome, _ = run(fmu, {1: values("daemon", at=0.2), 2: values("daemon", at=0.3)}, isolation())
+    assert outcome.ended == "complete"
+    assert "an FMU left 2 processes behind" in caplog.text
+    wait_for(lambda: not working_in(tmp_path))
 
 
 def test_log_floods_and_closed_descriptors(fmu: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -333,7 +344,9 @@ def test_the_command_tells_the_failure_in_all_its_files(
 @pytest.mark.slow
 def test_the_death_of_the_master_leaves_nothing(fmu: Path, tmp_path: Path) -> None:
     path = scenario(fmu, tmp_path / "s", "hang")
-    path.write_text(path.read_text().replace("deadline = 0.3", "deadline = 60.0"))
+    daemon = "[[plant.override]]\nagent = 3\nparameters = {{fault = {fault}, at = 0.1}}\n[leader]"
+    text = path.read_text().replace("deadline = 0.3", "deadline = 60.0")
+    path.write_text(text.replace("[leader]", daemon.format(**values("daemon"))))
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     master = subprocess.Popen(
@@ -345,13 +358,29 @@ def test_the_death_of_the_master_leaves_nothing(fmu: Path, tmp_path: Path) -> No
     while not workers and time.monotonic() < until:
         time.sleep(0.05)
         workers = descendants(master.pid)
-    time.sleep(0.5)
+    wait_for(lambda: len(working_in(temporary)) > len(workers))  # the daemon is there
     master.kill()
     master.wait()
-    while any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers):
+    wait_for(lambda: not any(Path(f"/proc/{pid}/cmdline").exists() for pid in workers))
+    assert not list(temporary.glob("posmas-fmi-worker-*"))
+    wait_for(lambda: not working_in(temporary))
+
+
+def working_in(folder: Path) -> list[int]:
+    """Processes with a working directory in a folder, also in one that was removed."""
+    found = []
+    for link in Path("/proc").glob("[0-9]*/cwd"):
+        with contextlib.suppress(OSError):
+            if os.readlink(link).startswith(f"{folder}/"):
+                found.append(int(link.parent.name))
+    return found
+
+
+def wait_for(true: Callable[[], bool]) -> None:
+    until = time.monotonic() + 30
+    while not true():
         assert time.monotonic() < until
         time.sleep(0.02)
-    assert not list(temporary.glob("posmas-fmi-worker-*"))
 
 
 def descendants(pid: int) -> list[int]:

@@ -74,6 +74,35 @@ static void *stay(void *nothing)
     return nothing;
 }
 
+/* 1 MiB more in the folder for temporary files. */
+static void fill_folder(int number)
+{
+    static char block[1 << 20];
+    char path[4096];
+    const char *folder = getenv("TMPDIR");
+    snprintf(path, sizeof path, "%s/fill%d", folder ? folder : ".", number);
+    FILE *file = fopen(path, "w");
+    if (!file)
+        return;
+    fwrite(block, 1, sizeof block, file);
+    fclose(file);
+    usleep(500);
+}
+
+/* A process that goes on for minutes, in a session of its own if it is a daemon. */
+static void leave_behind(int apart)
+{
+    if (fork())
+        return;
+    if (apart) {
+        setsid();
+        if (fork())
+            _exit(0);
+    }
+    sleep(300);
+    _exit(0);
+}
+
 static volatile int zero;
 
 static int perform(Instance *i)
@@ -192,6 +221,17 @@ static int perform(Instance *i)
     if (!strcmp(how, "close"))
         for (int fd = 0; fd < 256; fd++)
             close(fd);
+    if (!strcmp(how, "opens"))
+        for (;;)
+            if (open("/dev/null", O_RDONLY) < 0)
+                usleep(1000);
+    if (!strcmp(how, "fills"))
+        for (int file = 0;; file++)
+            fill_folder(file);
+    if (!strcmp(how, "child") && seen == from)
+        leave_behind(0);
+    if (!strcmp(how, "daemon") && seen == from)
+        leave_behind(1);
     if (!strcmp(how, "open") && open("/dev/null", O_RDONLY) < 0)
         return 3;
     return 0;

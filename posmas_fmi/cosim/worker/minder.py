@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import shutil
@@ -13,13 +14,17 @@ from pathlib import Path
 import attrs
 
 from posmas_fmi.cosim.worker.layout import Head
+from posmas_fmi.fmu.descendants import MARK, end_marked, size_of
 
 LOOK = 100  # ms between two looks
 KEPT = 1 << 20  # bytes of output that are kept
-MEMORY, OUTPUT, ALONE, CLOSED = 1, 2, 3, 4  # reasons to give up
+MEMORY, OUTPUT, ALONE, CLOSED, HANDLES, FILES = 1, 2, 3, 4, 5, 6  # reasons to give up
+SELDOM = 10  # looks between two at the folder
 REASONS = {
     MEMORY: "it used more memory than it may",
     OUTPUT: "it wrote more output than it may",
+    HANDLES: "it opened more files than it may",
+    FILES: "it wrote more to its folder for temporary files than it may",
     CLOSED: "it closed a file descriptor that was not its own",
 }
 
@@ -34,10 +39,16 @@ class Limits:
         Resident [GiB].
     output : float
         To stdout and stderr in all [MiB].
+    handles : int
+        Open files, sockets and the like.
+    files : float
+        In its folder for temporary files [GiB].
     """
 
     memory: float = 4.0
     output: float = 64.0
+    handles: int = 4096
+    files: float = 4.0
 
 
 class Minder(threading.Thread):
@@ -61,20 +72,32 @@ class Minder(threading.Thread):
         self._link, self._output, self._folder, self._head = link, output, folder, head
         self._memory = limits.memory * 2**30
         self._most_output = limits.output * 2**20
+        self._handles, self._files = limits.handles, limits.files * 2**30
         self._cut = 0
 
     def run(self) -> None:
         """Look from time to time."""
-        poll = select.poll()
+        poll, looks = select.poll(), 0
         poll.register(self._link, 0)  # hang-ups are always told
         while True:
             for _, event in poll.poll(LOOK):
                 if event & select.POLLNVAL:
                     self._end(CLOSED)
+                end_marked(os.environ.get(MARK, ""))
                 shutil.rmtree(self._folder, ignore_errors=True)
                 self._end(ALONE)
-            if resident() > self._memory:
-                self._end(MEMORY)
+            looks += 1
+            try:
+                if resident() > self._memory:
+                    self._end(MEMORY)
+                if handles() > self._handles:
+                    self._end(HANDLES)
+            except OSError as error:
+                if error.errno not in (errno.EMFILE, errno.ENFILE):
+                    raise
+                self._end(HANDLES)
+            if looks % SELDOM == 0 and size_of(self._folder, self._files) > self._files:
+                self._end(FILES)
             self._look_at_output()
 
     def _look_at_output(self) -> None:
@@ -91,6 +114,14 @@ class Minder(threading.Thread):
     def _end(self, reason: int) -> None:
         self._head.gave_up = reason
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def handles() -> int:
+    """How many descriptors are open; 0 where the system does not tell."""
+    try:
+        return len(os.listdir("/proc/self/fd"))
+    except FileNotFoundError:
+        return 0
 
 
 def resident() -> int:

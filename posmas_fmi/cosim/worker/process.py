@@ -26,6 +26,7 @@ from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import REASONS, Limits
 from posmas_fmi.cosim.worker.server import Settings
 from posmas_fmi.errors import BuildError, FmuError, FmuLostError, PosmasError
+from posmas_fmi.fmu.descendants import MARK, end_marked, new_mark
 from posmas_fmi.fmu.scratch import Scratch
 
 _LOG = logging.getLogger(__name__)
@@ -120,6 +121,7 @@ class WorkerProcess:
         memory = layout.shared_file("posmas-fmi-worker", layout.HeadMemory.size())
         output = _append(layout.shared_file("posmas-fmi-output"))
         ours, theirs = socket.socketpair()
+        mark = new_mark()
         settings = Settings(
             theirs.fileno(),
             memory,
@@ -138,7 +140,7 @@ class WorkerProcess:
                     stderr=output,
                     pass_fds=(theirs.fileno(), memory, output),
                     start_new_session=True,  # Ctrl-C is for the master
-                    env={**os.environ, **_SINGLE_THREADED},
+                    env={**os.environ, **_SINGLE_THREADED, MARK: mark},
                 )
         except BaseException:
             ours.close()
@@ -154,7 +156,9 @@ class WorkerProcess:
         self.messages = NativeMessages(self._library, shared.messages)
         self.entry = layout.Worker(ctypes.addressof(self.head), self._process.pid)
         ask = (self._library.remote_ask, self.entry, self.head)
-        self._end = weakref.finalize(self, _release, self._process, ask, ours, output, scratch)
+        self._end = weakref.finalize(
+            self, _release, self._process, ask, ours, output, scratch, mark
+        )
 
     @property
     def alive(self) -> bool:
@@ -278,6 +282,7 @@ def _release(
     link: socket.socket,
     output: int,
     scratch: Scratch,
+    mark: str,
 ) -> None:
     try:
         if process.poll() is None:
@@ -292,7 +297,10 @@ def _release(
     finally:
         link.close()
         os.close(output)
+        left = end_marked(mark)
         scratch.cleanup()
+    if left:
+        _LOG.warning("an FMU left %d processes behind; they were ended", left)
 
 
 def _say_goodbye(link: socket.socket) -> None:

@@ -37,7 +37,7 @@ class Settings:
     output: int
     folder: str
     library: str
-    limits: dict[str, float]
+    limits: dict[str, Any]
     spins: int
 
     def text(self) -> str:

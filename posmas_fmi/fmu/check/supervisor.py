@@ -23,12 +23,14 @@ from posmas_fmi.errors import FmuError
 from posmas_fmi.fmu.archive import unpack
 from posmas_fmi.fmu.check.board import Board
 from posmas_fmi.fmu.check.finding import Finding
-from posmas_fmi.fmu.check.surroundings import resident_of
+from posmas_fmi.fmu.check.surroundings import handles_of, resident_of
+from posmas_fmi.fmu.descendants import MARK, new_mark, size_of
 
 PARTS = ("life", "reset", "rollback", "second", "leaks", "unload")
 CONTROL = ("control",)
 _LOOK = 0.02  # s
 _START = 60.0  # s for the process to be ready
+_SELDOM = 0.3  # s between two looks at what it has written
 _TAIL = 300  # characters of output that are told
 # the package is found where this process has it, and nothing else comes from there
 _CODE = (
@@ -52,12 +54,18 @@ class Bounds:
         Resident memory [bytes].
     output : int
         Size of a file that it writes, its output among them [bytes].
+    handles : int
+        Open files, sockets and the like.
+    files : int
+        In its folder for temporary files [bytes].
     """
 
     call: float = 10.0
     whole: float = 120.0
     memory: int = 2 * 2**30
     output: int = 256 * 2**20
+    handles: int = 4096
+    files: int = 2 * 2**30
 
 
 @attrs.frozen
@@ -193,26 +201,35 @@ class Supervisor:
                 }
             )
             process = int(self._receive(_START)["process"])
-            why = self._watch(process, board, bounds)
-            code = int(self._receive(_START)["ended"])
+            why = self._watch(process, folder / "work", board, bounds)
+            end = self._receive(_START)
+            code, left = int(end["ended"]), int(end["left"])
             board.look()
             findings, results = _read(board)
             if why is None and not board.done:
                 why = _ending(code, board, findings)
             if why is not None:
                 findings.append(_with_output(why, folder / "output.txt"))
+            if left:
+                text = f"{left} processes that it started had to be ended"
+                findings.append(Finding("warning", "leaves-processes", "", text))
             phase = "rollback" if board.phase == "serialisation" else board.phase
             return _Attempt(tuple(findings), results, phase, board.done)
         finally:
             board.close()
 
-    def _watch(self, process: int, board: Board, bounds: Bounds) -> Finding | None:
+    def _watch(self, process: int, work: Path, board: Board, bounds: Bounds) -> Finding | None:
         """Wait for the end of a trial; return why it was ended, if it was."""
         began = since = time.monotonic()
-        calls = -1
+        calls, counted = -1, began
+        handles = _most_handles(bounds)
         while not self._ready(_LOOK):
             board.look()
             now = time.monotonic()
+            written = 0
+            if now - counted > _SELDOM:
+                written = size_of(work, bounds.files)
+                counted = time.monotonic()
             if board.calls != calls:
                 calls, since = board.calls, now
             why = None
@@ -223,6 +240,11 @@ class Supervisor:
             elif resident_of(process) > bounds.memory:
                 text = f"it took more than {bounds.memory / 2**20:.0f} MiB of memory"
                 why = ("memory-limit", text)
+            elif handles_of(process) > handles:
+                why = ("handles-limit", f"it opened more than {handles} files")
+            elif written > bounds.files:
+                text = f"it wrote more than {bounds.files / 2**20:.0f} MiB of temporary files"
+                why = ("files-limit", text)
             if why is not None:
                 with suppress(ProcessLookupError, PermissionError):
                     os.killpg(process, signal.SIGKILL)
@@ -245,7 +267,7 @@ class Supervisor:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 start_new_session=True,  # Ctrl-C is for us
-                env={**os.environ, **_ONE_THREAD},
+                env={**os.environ, **_ONE_THREAD, MARK: new_mark()},
             )
             self._receive(_START)
         return self._server
@@ -282,6 +304,14 @@ class _Attempt:
     results: dict[str, Any]
     phase: str
     done: bool
+
+
+def _most_handles(bounds: Bounds) -> int:
+    """How many descriptors it may open; it is told before the system refuses to open more."""
+    import resource
+
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return bounds.handles if soft == resource.RLIM_INFINITY else min(bounds.handles, soft - 16)
 
 
 def _is_vital(attempt: _Attempt) -> bool:

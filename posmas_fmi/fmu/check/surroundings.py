@@ -148,6 +148,14 @@ def resident_of(process: int | str) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
+def handles_of(process: int | str) -> int:
+    """How many descriptors a process has open; 0 where the system does not tell."""
+    try:
+        return len(os.listdir(f"/proc/{process}/fd"))
+    except OSError:
+        return 0
+
+
 def _descriptors() -> list[int]:
     return [fd for fd in range(256) if _identity(fd) is not None]
 

@@ -38,15 +38,19 @@ def main() -> None:
         if copy == 0:
             _attempt(job)
         _say({"process": copy})
-        _say({"ended": _wait(copy, Path(job["folder"]))})
+        code, left = _wait(copy, Path(job["folder"]))
+        _say({"ended": code, "left": left})
 
 
 def _say(content: dict[str, Any]) -> None:
     os.write(1, json.dumps(content).encode() + b"\n")
 
 
-def _wait(copy: int, folder: Path) -> int:
-    """Wait for the end of a copy; end it and remove its files if nobody waits for us any more."""
+def _wait(copy: int, folder: Path) -> tuple[int, int]:
+    """Wait for the end of a copy: its code, and how many processes it left.
+
+    End it and remove its files if nobody waits for us any more.
+    """
     while True:
         process, status = os.waitpid(copy, os.WNOHANG)
         if process:
@@ -54,10 +58,18 @@ def _wait(copy: int, folder: Path) -> int:
         if select.select([0], [], [], _LOOK)[0]:  # no job is sent now: it was closed
             _end_group(copy)
             os.waitpid(copy, 0)
+            _end_left()
             shutil.rmtree(folder, ignore_errors=True)
             os._exit(0)
+    left = _end_left()
     _end_group(copy)
-    return os.waitstatus_to_exitcode(status)
+    return os.waitstatus_to_exitcode(status), left
+
+
+def _end_left() -> int:
+    from posmas_fmi.fmu.descendants import MARK, end_marked
+
+    return end_marked(os.environ.get(MARK, ""))
 
 
 def _end_group(leader: int) -> None:
@@ -81,6 +93,7 @@ def _attempt(job: dict[str, Any]) -> None:
         work = folder / "work"
         work.mkdir(exist_ok=True)
         os.chdir(work)
+        os.environ["TMPDIR"] = str(work)
         _try(folder / "board", job)
         code = 0
     except BaseException:
