@@ -100,6 +100,8 @@ def _run(arguments: argparse.Namespace) -> int:
         return DONE
     folder = arguments.out or Path("out") / scenario.name
     branch = None
+    if arguments.at is not None and arguments.branch is None:
+        raise InputError("--at needs --branch DIR, the run whose snapshot that is")
     if arguments.branch is not None:
         if arguments.at is None:
             raise InputError("--branch needs --at S, the time of a snapshot of that run")

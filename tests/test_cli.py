@@ -125,6 +125,7 @@ def test_models_lists_what_ships(capsys):
         ["certify", "paper_example_1", "--gains", "missing.json"],
         ["run", "paper_example_1", "--until", "0.0001"],
         ["run", "paper_example_1", "--seed", "-1"],
+        ["run", "paper_example_1", "--at", "1"],
         ["check", "some.fmu"],
         ["linearise", "some.fmu", "--in", "u", "--out", "y"],
     ],

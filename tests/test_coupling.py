@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
+from fmu_examples import tank_fmu
+from fmu_scenarios import one_fmu
 
+from posmas_fmi import load, run
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
@@ -14,8 +19,10 @@ from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, System, simulate
 from posmas_fmi.cosim.plant import CallablePlant
 from posmas_fmi.cosim.wiring import Extra, Term, Wiring
+from posmas_fmi.errors import InputError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
+from posmas_fmi.scenario.job import scheduled
 
 H, STEPS = 0.1, 20
 DECAY = np.exp(-H)
@@ -98,3 +105,38 @@ def test_they_differ_and_slopes_come_closer() -> None:
     for coupling in COUPLINGS:
         held, sloped = (np.abs(by_hand(coupling, r) - exact.T).max() for r in (False, True))
         assert sloped < 0.3 * held, (coupling, held, sloped)
+
+
+@pytest.mark.parametrize(("gain", "unsettled"), [(0.5, 0), (1.5, 10)])
+def test_an_iteration_that_does_not_settle_is_told(
+    tmp_path: Path, gain: float, unsettled: int
+) -> None:
+    """A tank whose power follows its own surplus at once: a loop that contracts, or does not."""
+    more = f"""
+[[component]]
+name = "hall"
+fmu = "{tank_fmu(tmp_path, 3).name}"
+record = ["power", "net"]
+
+[[connection]]
+source = "hall.net"
+to = "hall.power"
+scale = {gain}
+offset = 10.0
+"""
+    engine = 'auto"\ncoupling = "iterate'
+    path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more, engine=engine)
+    summary = run(load(path), tmp_path / "out", report=False).summary
+    assert summary["unsettled_steps"] == unsettled
+    assert ("did not settle in 10 of 10 steps" in summary["reason"]) == bool(unsettled)
+    if not unsettled:
+        with xr.open_dataset(tmp_path / "out" / "results.nc") as found:
+            power, net = found["hall.power"].values[1:], found["hall.net"].values[1:]
+        np.testing.assert_allclose(power, gain * net + 10.0, rtol=1e-7)
+
+
+def test_an_input_is_set_by_one_thing(tmp_path: Path) -> None:
+    more = '[[connection]]\nsource = "2.net"\nto = "1.power"'
+    path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more)
+    with pytest.raises(InputError, match=r"1: the input 'power' is set by the control law already"):
+        scheduled(load(path))

@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fmu_examples import example_1
+from fmu_examples import example_1, tank_fmu
 from fmu_scenarios import one_fmu
 
 from posmas_fmi import load, run
 from posmas_fmi.errors import InputError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.start_values import read_back, settable
+from posmas_fmi.scenario.job import scheduled
 
 PUMP = """
 from pythonfmu import Fmi2Causality as C, Fmi2Initial as I, Fmi2Slave, Fmi2Variability as V
@@ -110,3 +111,35 @@ def test_arrays_are_start_values(tmp_path: Path) -> None:
         kept, refused = settable(file.about, values)
         instance.initialise(kept)
         assert (list(kept), refused, read_back(instance, kept)) == (list(values), [], [])
+
+
+@pytest.mark.parametrize(
+    ("more", "place", "told"),
+    [
+        ('parameters = {loss = "abc"}', "$.plant.parameters", "expected a number for 'loss'"),
+        (
+            "parameters = {loss = [1.0, 2.0]}",
+            "$.plant.parameters",
+            "expected one number for 'loss'",
+        ),
+        ("parameters = {fi = 1.0}", "$.plant.parameters", "there is no variable 'fi'"),
+        (
+            "[[plant.override]]\nagent = 2\nparameters = {fi = 1.0}",
+            "$.plant.override[0].parameters",
+            "there is no variable 'fi'",
+        ),
+        (
+            '[[component]]\nname = "h"\nfmu = "facility_header"\nparameters = {chiller = [1, 2]}',
+            "$.component[0].parameters",
+            "expected one number for 'chiller'",
+        ),
+    ],
+)
+def test_a_start_value_that_cannot_be_one_is_refused_before_anything_runs(
+    tmp_path: Path, more: str, place: str, told: str
+) -> None:
+    path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more)
+    with pytest.raises(InputError) as caught:
+        scheduled(load(path))
+    assert caught.value.where == place
+    assert told in str(caught.value)

@@ -17,7 +17,7 @@ from test_scenario_faults import scenario
 
 from posmas_fmi import load, run
 from posmas_fmi.cli import main
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import FmuError, InputError
 
 LOSSY = "[channel]\nloss = 0.3\njitter = 0.02\n"
 
@@ -95,7 +95,7 @@ def test_a_run_that_is_cut_off_at_its_start_has_nothing_of_the_one_before(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(job, "_simulate", cut_off)
+        patch.setattr(job, "_recorder", cut_off)  # all FMUs run
         with pytest.raises(KeyboardInterrupt):
             run(made(tmp_path, ""), tmp_path / "out", report=False)
     assert {path.name for path in (tmp_path / "out").rglob("*.*")} == {
@@ -104,6 +104,24 @@ def test_a_run_that_is_cut_off_at_its_start_has_nothing_of_the_one_before(
     }
     again = run(made(tmp_path, ""), tmp_path / "out", report=False, resume=True)
     assert again.summary["messages_lost"] == 0
+
+
+def test_a_run_whose_fmus_do_not_start_leaves_the_one_before_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from posmas_fmi.scenario.plant import Instances
+
+    def refuses(_: object) -> None:
+        raise FmuError("refuses its start values")
+
+    run(made(tmp_path), tmp_path / "out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
+    assert {"results.nc", "summary.json", "report.html"} <= {path.name for path in before}
+    with monkeypatch.context() as patch:
+        patch.setattr(Instances, "start", refuses)
+        with pytest.raises(FmuError):
+            run(made(tmp_path, ""), tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
 
 
 def test_what_cannot_go_on(tmp_path: Path) -> None:

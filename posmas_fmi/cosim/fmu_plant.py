@@ -37,7 +37,7 @@ from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
 from posmas_fmi.fmu.open import open_fmu
-from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable
+from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable, spread
 from posmas_fmi.fmu.units import Conversion
 from posmas_fmi.interrupt import Interrupt
 
@@ -433,8 +433,8 @@ def _start_all(
 
 
 def _initialise(instance: FmuInstance, spec: PlantSpec, stop: float) -> list[StartFinding]:
-    given = _existing(instance.file, spec.values)
-    values, refused = settable(instance.file.about, given, spec.name)
+    about = instance.file.about
+    values, refused = settable(about, spread(about, spec.values), spec.name)
     instance.initialise(values, stop=stop, tolerance=spec.tolerance)
     return [*refused, *read_back(instance, values)]
 
@@ -505,25 +505,3 @@ def converted(about: About, ports: PortMap) -> PortMap:
         scale.append(found.scale * factor)
         offset.append(found.scale * shift + found.offset)
     return attrs.evolve(ports, scale=tuple(scale), offset=tuple(offset), units=(None,) * len(scale))
-
-
-def _existing(file: FmuFile, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Spread arrays over elements where the FMU (version 2) has no arrays; refuse unknown names."""
-    spread: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in file.variables or isinstance(value, str):
-            spread[name] = value
-            continue
-        array = np.asarray(value, dtype=float)
-        if array.ndim == 0:
-            spread[name] = value
-            continue
-        for index in np.ndindex(array.shape):
-            label = ",".join(str(i + 1) for i in index)
-            spread[f"{name}[{label}]"] = float(array[index])
-    for name in spread:
-        try:
-            file.variable(name)
-        except FmuError as error:
-            raise InputError(f"{file.path.name}: {error.message}", "$.plant.parameters") from None
-    return spread

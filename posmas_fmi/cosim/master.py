@@ -48,7 +48,7 @@ class Iteration:
     """
 
     tolerance: float = 1e-8
-    most: int = 20
+    most: int = 100
 
 
 @attrs.frozen(eq=False)
@@ -247,6 +247,8 @@ class Outcome:
     replay_noise : float or None
         What a step that was done again differed by, relative to the size of a reading or 1; None
         where none was.
+    unsettled : int
+        Steps in which the iteration of coupled FMUs did not settle.
     """
 
     ended: Literal["complete", "terminated", "diverged", "failed", "cancelled"]
@@ -263,6 +265,7 @@ class Outcome:
     failed_agent: str = ""
     incidents: tuple[Failure, ...] = ()
     replay_noise: float | None = None
+    unsettled: int = 0
 
 
 def simulate(
@@ -385,6 +388,7 @@ class Run:
         self.limit = np.inf
         self.noisy = system.noisy
         self.replay_noise = 0.0  # of a reading, relative to its size or 1
+        self.unsettled = 0  # steps
 
     def run(self) -> Outcome:
         """Run to the end."""
@@ -422,6 +426,7 @@ class Run:
             failed_agent=agent,
             incidents=tuple(self.plant.failures),
             replay_noise=None if self.system.iteration is None else self.replay_noise,
+            unsettled=self.unsettled,
         )
 
     def _loop(self, interrupt: Interrupt) -> None:
@@ -591,11 +596,13 @@ class Run:
             if change <= tolerance:
                 break
         else:
-            log.warning(
-                "the coupling did not settle at t = %g s: readings still change by %.2g",
-                system.clock.time(k),
-                change,
-            )
+            if not self.unsettled:
+                log.warning(
+                    "the coupling did not settle at t = %g s: readings still change by %.2g",
+                    system.clock.time(k),
+                    change,
+                )
+            self.unsettled += 1
         state.readings = latest
 
     def _measure_noise(self, saved: Any, latest: Array) -> Array:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import attrs
 import numpy as np
 
-from posmas_fmi.errors import FmuError
+from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.instance import FmuInstance
-from posmas_fmi.fmu.variables import Variable
+from posmas_fmi.fmu.variables import REAL, WHOLE, Variable
 
 _SAME = {"Float32": 1e-6}  # relative, by type: rounding of what was set
 _SAME_DOUBLE = 1e-12
@@ -34,6 +35,53 @@ class StartFinding:
     variable: str
     what: str
     message: str
+
+
+def spread(about: About, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values as this FMU takes them: arrays by element where it has no arrays.
+
+    Parameters
+    ----------
+    about : About
+    values : mapping
+        By name.
+
+    Raises
+    ------
+    InputError
+        If there is no such variable, or a value is not of its type or shape.
+    """
+    spreads: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, str) or name in about.variables or np.ndim(value) == 0:
+            spreads[name] = value
+            continue
+        array = np.asarray(value, dtype=float)
+        for index in np.ndindex(array.shape):
+            label = ",".join(str(i + 1) for i in index)
+            spreads[f"{name}[{label}]"] = float(array[index])
+    for name, value in spreads.items():
+        problem = _misfit(about, name, value)
+        if problem:
+            raise InputError(f"{about.path.name}: {problem}")
+    return spreads
+
+
+def _misfit(about: About, name: str, value: Any) -> str:
+    """Tell what keeps a value from being one of the variable of that name, or nothing."""
+    try:
+        variable, index = about.names.resolve(name)
+    except FmuError as error:
+        return error.message
+    if _is_text(value) and variable.type in REAL | WHOLE:
+        return f"expected a number for {name!r}, which is {variable.type} (got {value!r})"
+    if not _is_text(value) and variable.type == "String":
+        return f"expected a text for {name!r} (got {value!r})"
+    shape = () if index is not None else variable.shape
+    if not _is_text(value) and np.shape(value) not in (shape, (math.prod(shape),)):
+        words = f"an array of shape {shape}" if shape else "one number"
+        return f"expected {words} for {name!r} (got {value!r})"
+    return ""
 
 
 def settable(

@@ -20,11 +20,13 @@ from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.job import (
     RunResult,
+    extras,
     make_design_of,
     make_law,
     run_designed,
     write_json,
 )
+from posmas_fmi.scenario.plant import fmu_files, make_instances
 from posmas_fmi.scenario.tables import CompareTable, ControlTable
 
 _LOOK = 0.2  # s between two looks at the runs
@@ -111,6 +113,7 @@ def run_comparison(
         place = f"$.controllers.{name}" if name in scenario.controllers else "$.control"
         try:
             make_law(one, designed)
+            make_instances(one, fmu_files(one), extras(one))
         except InputError as error:
             raise InputError(error.message, error.where.replace("$.control", place, 1)) from None
     with occupied(folder):

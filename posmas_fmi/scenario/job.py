@@ -8,6 +8,7 @@ import logging
 import platform
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -210,21 +211,21 @@ def _run_in(
         beginning = branched(scenario, *branch)
         told["branch"] = {"of": branch[0].name, "at": branch[1]}
         scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
-    for name in ("summary.json", "report.html", "results.csv"):
-        (folder / name).unlink(missing_ok=True)
-    if not resume:  # a run that is cut off from here on does not go on with what another one left
-        (folder / "results.nc").unlink(missing_ok=True)
-        forget_snapshots(folder)
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     if scenario.cooling is not None:
         from posmas_fmi.scenario.cooling import proved
 
         facts |= proved(scenario.control, designed)
-    write_json(folder / "design.json", facts)
-    write_json(folder / "manifest.json", told)
 
     def started(plant: FmuPlant) -> None:
+        """All FMUs run: only now is what an earlier run left in the folder given up."""
+        for name in ("summary.json", "report.html", "results.csv"):
+            (folder / name).unlink(missing_ok=True)
+        if not resume:  # a run cut off from here on does not go on with what another one left
+            (folder / "results.nc").unlink(missing_ok=True)
+            forget_snapshots(folder)
         told["start_values"] = grouped(plant.start_values)
+        write_json(folder / "design.json", facts)
         write_json(folder / "manifest.json", told)
 
     began = time.perf_counter()
@@ -269,11 +270,12 @@ def _simulate(
     recorded, baselines = tuple(scenario.record.variables), scenario.baseline
     with_baseline = baselines and "x" in recorded
     variables = (*recorded, "x_baseline") if with_baseline else recorded
-    with (
-        instances.start() as plant,
-        _recorder(scenario, designed.network, instances, folder, variables, beginning) as recorder,
-    ):
+    with ExitStack() as stack:
+        plant = stack.enter_context(instances.start())
         started(plant)
+        recorder = stack.enter_context(
+            _recorder(scenario, designed.network, instances, folder, variables, beginning)
+        )
         system = make_system(scenario, designed, instances)
         split, more = instances.recorded, _more(scenario, system.law)
 

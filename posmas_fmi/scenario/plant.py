@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
+from posmas_fmi.fmu.start_values import spread
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.faults import make_crashes
 from posmas_fmi.scenario.tables import Override, Port
@@ -126,8 +128,8 @@ def make_instances(
     Raises
     ------
     InputError
-        If an FMU does not allow the period, ports are missing, do not fit an FMU or its units, or
-        what is wired to what is not clear.
+        If an FMU does not allow the period, ports or start values do not fit it or its units, ports
+        are missing, or what is wired to what is not clear.
     """
     plant, N = scenario.plant, scenario.network.N
     values = [_values(scenario, k) for k in range(N)]
@@ -148,6 +150,7 @@ def make_instances(
         Instance(table.name, abouts[path], table.parameters, nothing, nothing, table.tolerance)
         for table, path in zip(scenario.components, files[N:], strict=True)
     ]
+    _check_values(scenario, (*agents, *components))
     wires = Wires(
         agents,
         components,
@@ -280,6 +283,30 @@ def _values(scenario: Scenario, k: int) -> dict[str, Any]:
         if override.agent == k + 1:
             values |= override.parameters
     return values
+
+
+def _check_values(scenario: Scenario, instances: Sequence[Instance]) -> None:
+    """Refuse start values that an FMU does not have, or of another type or shape."""
+    known = set()
+    for k, one in enumerate(instances):
+        told = [(name, type(value), np.shape(value)) for name, value in one.values.items()]
+        if (key := (one.about.path, *told)) not in known:
+            known.add(key)
+            for name, value in one.values.items():
+                try:
+                    spread(one.about, {name: value})
+                except InputError as error:
+                    raise InputError(error.message, _place(scenario, k, name)) from None
+
+
+def _place(scenario: Scenario, k: int, name: str) -> str:
+    """Where the start value of instance k of that name stands in the scenario."""
+    if k >= scenario.network.N:
+        return f"$.component[{k - scenario.network.N}].parameters"
+    for i, override in reversed(list(enumerate(scenario.plant.override))):
+        if override.agent == k + 1 and name in override.parameters:
+            return f"$.plant.override[{i}].parameters"
+    return "$.plant.parameters" if name in scenario.plant.parameters else "$.agent"
 
 
 def _shipped_values(scenario: Scenario) -> dict[str, Any]:

@@ -40,12 +40,13 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         }
         for k, name in enumerate(names)
     ]
-    noise = outcome.replay_noise
+    noise, iterated = outcome.replay_noise, outcome.replay_noise is not None
     return {
         **({} if noise is None else {"replay_noise": _finite(noise)}),
+        **({"unsettled_steps": outcome.unsettled} if iterated else {}),
         "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
         "ended": outcome.ended,
-        "reason": outcome.reason or _frozen_reason(outcome),
+        "reason": outcome.reason or _frozen_reason(outcome) or _unsettled_reason(outcome),
         "agents": agents,
         "tracking_error_final": _finite(outcome.tracking_error.max()),
         "estimation_error_final": _finite(outcome.estimation_error.max()),
@@ -83,6 +84,15 @@ def _verdict(outcome: Outcome, statuses: list[str]) -> str:
 def _frozen_reason(outcome: Outcome) -> str:
     names = _frozen(outcome)
     return f"frozen after a failure of the FMU: {', '.join(names)}" if names else ""
+
+
+def _unsettled_reason(outcome: Outcome) -> str:
+    if not outcome.unsettled:
+        return ""
+    return (
+        f"the coupling of FMUs did not settle in {outcome.unsettled} of {outcome.steps} steps: "
+        "what they show is not that of the coupled system"
+    )
 
 
 def _frozen(outcome: Outcome) -> list[str]:

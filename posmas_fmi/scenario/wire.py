@@ -80,8 +80,13 @@ class Instance:
         InputError
             If it is set by something else already.
         """
-        if variable in self.extras or variable in self.inputs.variables:
-            raise InputError(f"{self.name}: the input {variable!r} is set twice", place)
+        by_law = variable in self.inputs.variables
+        if by_law or variable in self.extras:
+            other = "the control law" if by_law else "another connection or signal"
+            raise InputError(
+                f"{self.name}: the input {variable!r} is set by {other} already; leave one out",
+                place,
+            )
         self.extras[variable] = extra
 
     def spec(self) -> PlantSpec:
