@@ -473,14 +473,50 @@ def _from_named_arcs(
 
 
 def _read_matrix_market(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
-    import scipy.io
-
-    rows, columns, entries, form, *_ = scipy.io.mminfo(path)
+    """Read it here: SciPy's reader ends the process on some broken files."""
+    with path.open(encoding="utf-8") as stream:
+        head = stream.readline().lower().split()
+        words = [w for line in stream if not line.startswith("%") for w in line.split()]
+    form, field, symmetry = head[2:5] if head[:2] == ["%%matrixmarket", "matrix"] else ("",) * 3
+    if (
+        form not in ("coordinate", "array")
+        or field not in ("real", "double", "integer", "pattern")
+        or symmetry not in ("general", "symmetric")
+    ):
+        raise NetworkError(
+            f"{path.name}, line 1: expected %%MatrixMarket matrix, coordinate or array, real, "
+            f"integer or pattern, general or symmetric (got {' '.join(head)[:60]!r})",
+            "$.network.file",
+        )
+    width = 3 if form == "coordinate" else 2
+    rows, columns, *_ = size = [int(word) for word in words[:width]]
     _check_size(max(rows, columns), "$.network.file")
-    if (rows * columns if form == "array" else entries) > path.stat().st_size:
-        raise NetworkError(f"{path.name} has fewer numbers than it says", "$.network.file")
-    matrix = sp.csr_array(scipy.io.mmread(path))
-    return matrix, tuple(str(k + 1) for k in range(matrix.shape[0]))
+    numbers = np.array(words[width:], dtype=float)
+    if form == "array":
+        full = rows * columns if symmetry == "general" else rows * (rows + 1) // 2
+        n = rows if numbers.size == full else 0
+        if symmetry == "general":
+            row, column = (k.ravel("F") for k in np.indices((n, columns if n else 0)))
+        else:  # the lower triangle, column by column
+            column, row = np.triu_indices(n)
+        values, said, each = numbers, full, 1
+    else:
+        table = numbers[: numbers.size - numbers.size % (each := 2 + (field != "pattern"))]
+        table = table.reshape(-1, each)
+        row, column = table[:, 0].astype(int) - 1, table[:, 1].astype(int) - 1
+        values = table[:, 2] if each == 3 else np.ones(len(table))
+        said = size[2]
+    if numbers.size != said * each:
+        raise NetworkError(f"{path.name} has fewer numbers than it says, or more", "$.network.file")
+    if symmetry == "symmetric":
+        apart = row != column
+        row, column, values = (
+            np.concatenate([row, column[apart]]),
+            np.concatenate([column, row[apart]]),
+            np.concatenate([values, values[apart]]),
+        )
+    matrix = sp.csr_array((values, (row, column)), shape=(rows, columns))
+    return matrix, tuple(str(k + 1) for k in range(rows))
 
 
 def _read_graphml(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fuzz.readers import READERS, beginnings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from posmas_fmi.cooling.loads import read_loads
+from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import InputError, NetworkError
 from posmas_fmi.network import read_adjacency
+from posmas_fmi.report.json_files import read_json
 from posmas_fmi.scenario import load
 
 WORDS = [
@@ -113,6 +119,7 @@ NETWORKS = {
     "far.csv": "from,to\n1,2\n2,99999999999\n",
     "far.mtx": "%%MatrixMarket matrix coordinate real general\n3000000000 3000000000 1\n1 2 1.0\n",
     "short.mtx": "%%MatrixMarket matrix array real general\n900000 900000\n1.0\n",
+    "none.mtx": "%%MatrixMarket matrix coordinate real general\n9 9 2\n1 2 1.0\n",
     "few.mtx": "%%MatrixMarket matrix coordinate real general\n9 9 999999999999\n1 2 1.0\n",
 }
 
@@ -123,6 +130,36 @@ def test_small_files_of_huge_networks_are_refused(name: str, tmp_path: Path) -> 
     path.write_text(NETWORKS[name])
     with pytest.raises(NetworkError, match=r"at most 1000000 agents|fewer numbers than it says"):
         read_adjacency(path)
+
+
+def test_facts_of_a_snapshot_that_are_none(tmp_path: Path) -> None:
+    """They ended with a KeyError."""
+    for text in (b"{}", b"[]", b'{"k": "x", "counts": 3, "serialised": 1}'):
+        np.savez(tmp_path / "s.npz", facts=np.frombuffer(text, dtype=np.uint8))
+        with pytest.raises(InputError, match="not a snapshot"):
+            Snapshot.load(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize("depth", [300, 600, 900, 100_000])
+def test_json_that_is_too_deep(tmp_path: Path, depth: int) -> None:
+    path = tmp_path / "design.json"
+    path.write_text('{"a": ' + "[" * depth + "]" * depth + "}")
+    with suppress(InputError):
+        read_json(path)
+
+
+def test_packed_loads_that_are_damaged_or_huge(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "loads.csv.gz"
+    whole = gzip.compress(b"time_s,rack1_kW\n" + b"0,1\n" * 1000, mtime=0)
+    path.write_bytes(whole[:14] + b"\xff\xff\xff" + whole[17:])
+    with pytest.raises(InputError, match="expected a CSV file"):
+        read_loads(path)
+    monkeypatch.setattr("posmas_fmi.cooling.loads._LARGEST_FILE", 1000)
+    path.write_bytes(whole)
+    with pytest.raises(InputError, match="larger than 1000 bytes"):
+        read_loads(path)
 
 
 @settings(max_examples=100)

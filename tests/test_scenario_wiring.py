@@ -184,6 +184,10 @@ BAD_NETCDF = {
     "unit": ({"time": ("time", np.array([0.0, 1.0]), {"units": "h"})}, "time in s"),
     "order": ({"time": ("time", np.array([1.0, 0.0]), {"units": "s"})}, "increasing times"),
     "columns": ({"load": (("time", "agent"), np.ones((2, 2)))}, "one for each agent"),
+    "missing": (
+        {"load": (("time", "agent"), np.array([[1.0, -99.0, 3.0]] * 2), {"missing_value": -99.0})},
+        "fill the gap",
+    ),
 }
 
 
@@ -192,6 +196,41 @@ def test_netcdf_that_is_no_signal(name: str, folder: Path) -> None:
     changes, message = BAD_NETCDF[name]
     netcdf(folder, **changes)
     with pytest.raises((InputError, ScenarioError), match=message):
+        load(write(folder, *NC))
+
+
+def test_a_unit_that_contradicts_the_scenario(folder: Path) -> None:
+    netcdf(folder, load=(("time", "agent"), np.ones((2, 3)), {"units": "MW"}))
+    (change,) = NC
+    for unit, more in (("kW", ""), ("kW", "scale = 1e3"), ("MW", "")):
+        scale = ("scale = 1e3", f'unit = "{unit}"\n{more}')
+        path = write(folder, change, scale)
+        if unit == "kW" and not more:
+            with pytest.raises((InputError, ScenarioError), match="the file says 'MW'"):
+                load(path)
+        else:
+            assert load(path).signals is not None
+
+
+def test_packed_netcdf(folder: Path) -> None:
+    """Integers with scale_factor and add_offset, as weather services write them."""
+    values = np.array([[80, 70, 90], [100, 70, 60]])
+    how = {"scale_factor": 0.5, "add_offset": 10.0}
+    netcdf(folder, load=(("time", "agent"), 2 * (values - 10), how))
+    of_csv, of_netcdf = (load(write(folder, *change)).signals for change in ((), NC))
+    assert of_csv is not None
+    assert of_netcdf is not None
+    np.testing.assert_array_equal(of_csv.rows(0, 12), of_netcdf.rows(0, 12))
+
+
+def test_netcdf_that_says_to_hold_terabytes(folder: Path) -> None:
+    import h5netcdf
+
+    with h5netcdf.File(folder / "loads.nc", "w") as file:
+        file.dimensions = {"time": 10**12}
+        for name in ("time", "load"):
+            file.create_variable(name, ("time",), float, chunks=(1000,))
+    with pytest.raises((InputError, ScenarioError), match="more than 1e"):
         load(write(folder, *NC))
 
 

@@ -6,6 +6,7 @@ import csv
 import gzip
 import math
 import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from posmas_fmi.expression import Array
 
 _POWER = {"W": 1.0, "kW": 1e3, "MW": 1e6}
 _TEMPERATURE = {"degC": 273.15, "K": 0.0}
+_LARGEST_FILE = 1_000_000_000  # bytes, unpacked
 _LARGEST = 1e8  # W for one line: beyond it a unit is wrong
 
 
@@ -405,10 +407,15 @@ def read_loads(path: str | Path, max_gap: float | None = None) -> Loads:
 
 def _rows(path: Path, where: str) -> list[list[str]]:
     try:
-        data = path.read_bytes()
-        text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8")
-        rows = [row for row in csv.reader(text.splitlines()) if row]
-    except (OSError, EOFError, ValueError, csv.Error) as error:
+        with path.open("rb") as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            source = gzip.GzipFile(fileobj=file) if packed else file
+            data = source.read(_LARGEST_FILE + 1)
+        if len(data) > _LARGEST_FILE:
+            raise ValueError(f"it is larger than {_LARGEST_FILE:g} bytes")
+        rows = [row for row in csv.reader(data.decode("utf-8").splitlines()) if row]
+    except (OSError, EOFError, ValueError, zlib.error, csv.Error) as error:
         raise InputError(f"expected a CSV file ({error})", where) from error
     if len(rows) < 2:
         raise InputError("expected a row of names and a row of values or more", where)

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from posmas_fmi.errors import ArchiveError
+from posmas_fmi.errors import ArchiveError, InputError
 from posmas_fmi.fmu.check import xml
 from posmas_fmi.fmu.check.finding import Finding
 
@@ -57,6 +57,22 @@ def unpack(fmu: Path, folder: Path) -> None:
         raise ArchiveError(f"expected a zip archive that can be read ({error})", where) from error
 
 
+def require_file(path: Path) -> None:
+    """Raise InputError if there is no file."""
+    if not path.is_file():
+        raise InputError(f"expected an FMU ({_instead(path)})", str(path))
+
+
+def _instead(path: Path) -> str:
+    """Say what there is, where there is no file."""
+    try:
+        if path.is_dir():
+            return "this is a folder; zip what is in it"
+        return "this is no regular file" if path.exists() else "there is no such file"
+    except OSError as error:
+        return str(error.strerror)
+
+
 def examine(fmu: Path, whole: bool = False) -> list[Finding]:
     """Return what is wrong with an archive; nothing is written and no code runs.
 
@@ -72,7 +88,7 @@ def examine(fmu: Path, whole: bool = False) -> list[Finding]:
         A fatal one stands for an archive that `unpack` refuses.
     """
     if not fmu.is_file():
-        return [_fatal("archive-missing", "", "expected an FMU (there is no such file)")]
+        return [_fatal("archive-missing", "", f"expected an FMU ({_instead(fmu)})")]
     try:
         with zipfile.ZipFile(fmu) as archive:
             findings = list(_entries(archive.infolist(), fmu.stat().st_size))

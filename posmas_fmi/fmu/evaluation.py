@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from posmas_fmi.errors import ArchiveError, FmuCallError, FmuError, InputError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.archive import require_file
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
@@ -92,8 +93,7 @@ def open_fmu(path: str | Path, interface: Interface | None = None) -> FmuFile:
     FmuError
         If it has no such interface, or cannot be loaded.
     """
-    if not Path(path).is_file():
-        raise InputError("expected an FMU (there is no such file)", str(path))
+    require_file(Path(path))
     if interface == "Model Exchange":
         return ModelExchangeFile(path)
     if interface == "Co-Simulation":

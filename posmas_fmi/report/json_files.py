@@ -30,7 +30,7 @@ from posmas_fmi.report.foreign import AGAIN, clean, number, one_line
 def read_json(path: Path) -> dict[str, Any]:
     """Read a file that holds one JSON object; InputError if it does not."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = _cleaned(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise InputError(f"the file is missing; {AGAIN}", str(path)) from None
     except OSError as error:
@@ -41,7 +41,7 @@ def read_json(path: Path) -> dict[str, Any]:
         raise InputError(
             f"expected a JSON object (got {type(content).__name__}); {AGAIN}", str(path)
         )
-    return {str(key): value for key, value in _cleaned(content).items()}
+    return {str(key): value for key, value in content.items()}
 
 
 def _cleaned(value: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,7 @@ def read_signal(
         return Signal(np.zeros(1), np.full((1, 1), table.scale * table.value + table.offset))
     path = folder / str(table.file)
     netcdf = path.suffix.lower() in NETCDF
-    header, rows = _read_netcdf(path, place) if netcdf else _read(path, place)
+    header, rows = _read_netcdf(path, place, table) if netcdf else _read(path, place)
     wanted = _wanted(table.columns, header)
     missing = [column for column in wanted if column not in header]
     if missing:
@@ -225,37 +226,78 @@ def _generate(table: Generated, agents: int, until: float, period: float, seed: 
     return Signal(loads.time, loads.power)
 
 
-def _read_netcdf(path: Path, place: str) -> tuple[list[str], Array]:
+def _read_netcdf(path: Path, place: str, table: SignalTable) -> tuple[list[str], Array]:
     """Names and numbers of the variables over ``time`` of a NetCDF-4 file, as of a CSV file.
 
     A variable over time and another dimension gives the columns ``name[1]``, ``name[2]``, …
     """
     import h5netcdf
+    import h5py
 
     where = f"{place}.file"
     if not path.is_file():
         raise InputError(f"there is no file {path.name!r} beside the scenario", where)
     try:
+        with h5py.File(path, "r") as raw:  # h5netcdf leaves a broken file half open
+            dict(raw.attrs)
+            raw.visititems(lambda _, entry: dict(entry.attrs) and None)
         with h5netcdf.File(path, "r") as file:
+            _check_sizes(file, path, where)
             if "time" not in file.variables or file["time"].dimensions != ("time",):
                 raise InputError(f"{path.name}: expected a variable time over time [s]", where)
             _check_seconds(file["time"], path, where)
-            header, columns = ["time"], [np.asarray(file["time"][...], dtype=float)[:, None]]
+            header, columns = ["time"], [_numbers(file["time"])[:, None]]
             for name, variable in file.variables.items():
                 numeric = variable.dtype is not str and np.dtype(variable.dtype).kind in "fiu"
                 if name == "time" or not numeric or variable.dimensions[:1] != ("time",):
                     continue
                 if len(variable.dimensions) > 2:
                     continue
-                values = np.asarray(variable[...], dtype=float).reshape(len(columns[0]), -1)
+                values = _numbers(variable).reshape(len(columns[0]), -1)
                 one = len(variable.dimensions) == 1
                 header += [name] if one else [f"{name}[{k + 1}]" for k in range(values.shape[1])]
                 columns.append(values)
-    except (OSError, ValueError, KeyError) as error:
+                if not table.columns or {name, *header[-values.shape[1] :]} & set(table.columns):
+                    _check_unit(variable.attrs.get("units"), table, f"{path.name}, {name}", place)
+    except InputError:
+        raise
+    except Exception as error:  # whatever HDF5 and what lies above it raise on a broken file
         raise InputError(f"{path.name} cannot be read as NetCDF-4: {error}", where) from None
     if len(header) < 2 or not len(columns[0]):
         raise InputError(f"{path.name}: expected a variable over time beside time", where)
     return header, np.concatenate(columns, axis=1)
+
+
+def _check_sizes(file: Any, path: Path, where: str) -> None:
+    """Refuse a file that says to hold too much: some kilobytes may say anything."""
+    for variable in file.variables.values():
+        if math.prod(variable.shape) * 8 > LARGEST_FILE:
+            raise InputError(f"{path.name} holds more than {LARGEST_FILE:g} bytes", where)
+
+
+def _check_unit(unit: Any, table: SignalTable, what: str, place: str) -> None:
+    """Refuse a file that contradicts the scenario, unless it is scaled there."""
+    scaled = table.scale != 1.0 or table.offset != 0.0
+    if unit is not None and table.unit is not None and unit != table.unit and not scaled:
+        raise InputError(
+            f"{what}: the file says {unit!r} and the scenario {table.unit!r}; write scale and "
+            "offset, or the unit of the file",
+            f"{place}.unit",
+        )
+
+
+def _numbers(variable: Any) -> Array:
+    """Values as CF means them: packed ones unpacked, missing ones NaN."""
+    values = np.asarray(variable[...], dtype=float)
+    missing = np.zeros(values.shape, dtype=bool)
+    for name in ("_FillValue", "missing_value"):
+        if name in variable.attrs:
+            missing |= np.isin(values, np.asarray(variable.attrs[name], dtype=float))
+    scale, offset = (
+        float(np.ravel(variable.attrs.get(name, default))[0])
+        for name, default in (("scale_factor", 1.0), ("add_offset", 0.0))
+    )
+    return np.where(missing, np.nan, scale * values + offset)
 
 
 def _check_seconds(time: Any, path: Path, where: str) -> None:

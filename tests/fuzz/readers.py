@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -9,8 +10,11 @@ from functools import cache
 from pathlib import Path
 
 import hostile
+import numpy as np
 
 from posmas_fmi import resources
+from posmas_fmi.cooling.loads import read_loads
+from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import PosmasError
 from posmas_fmi.expression import parse
 from posmas_fmi.fmu.check.described import read_description
@@ -19,7 +23,12 @@ from posmas_fmi.fmu.check.finding import worst
 from posmas_fmi.fmu.check.image import ImageError, read_image
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.xml import scan
+from posmas_fmi.fmu.compare import read_reference
+from posmas_fmi.network import read_adjacency
+from posmas_fmi.report.json_files import design_facts, read_json, summary_facts
 from posmas_fmi.scenario import load
+from posmas_fmi.scenario.signals import read_signal
+from posmas_fmi.scenario.tables import SignalTable
 
 
 def expression(data: bytes) -> None:
@@ -46,6 +55,58 @@ def xml(data: bytes) -> None:
         description_findings(read_description(data))
 
 
+def signal(data: bytes) -> None:
+    """Read a signal from CSV."""
+    path = _file("fuzz.csv", data)
+    with suppress(PosmasError):
+        read_signal("s", SignalTable(file=path.name), 2, path.parent)
+
+
+def netcdf(data: bytes) -> None:
+    """Read a signal from NetCDF."""
+    path = _file("fuzz.nc", data)
+    with suppress(PosmasError):
+        read_signal("s", SignalTable(file=path.name), 2, path.parent)
+
+
+def loads(data: bytes) -> None:
+    """Read heat loads, packed or not."""
+    with suppress(PosmasError):
+        read_loads(_file("loads.csv.gz", data))
+
+
+def network(data: bytes) -> None:
+    """Read a digraph, in each of the formats."""
+    for kind in ("csv", "mtx", "graphml"):
+        with suppress(PosmasError):
+            read_adjacency(_file(f"fuzz.{kind}", data))
+
+
+def reference(data: bytes) -> None:
+    """Read a reference result."""
+    with suppress(PosmasError):
+        read_reference(_file("reference.csv", data))
+
+
+def snapshot(data: bytes) -> None:
+    """Read a snapshot of a run."""
+    with suppress(PosmasError):
+        Snapshot.load(_file("fuzz.npz", data))
+
+
+def facts(data: bytes) -> None:
+    """Read a JSON file of a run, as the report does."""
+    path = _file("design.json", data)
+    with suppress(PosmasError):
+        content = read_json(path)
+        for reader in (
+            lambda: design_facts(content, {}, path),
+            lambda: summary_facts(content, path),
+        ):
+            with suppress(PosmasError):
+                reader()
+
+
 def image(data: bytes) -> None:
     """Read the tables of a shared library."""
     with suppress(ImageError):
@@ -58,6 +119,13 @@ READERS: dict[str, Callable[[bytes], None]] = {
     "archive": archive,
     "xml": xml,
     "image": image,
+    "signal": signal,
+    "netcdf": netcdf,
+    "loads": loads,
+    "network": network,
+    "reference": reference,
+    "snapshot": snapshot,
+    "facts": facts,
 }
 
 
@@ -85,8 +153,42 @@ def _beginnings(reader: str) -> Iterator[bytes]:
     elif reader == "xml":
         for fmi in (2, 3):
             yield hostile.corpus.entries(fmi)[hostile.corpus.XML]
+    elif reader in ("signal", "reference", "loads"):
+        yield b"time,a,b\n0,1,2\n1.5,3,4e0\n"
+        yield b"# band: height=1e-07, width=0\ntime,x\n0,1\n2,3\n"
+        yield b"time_s,rack1_kW,wet_bulb_degC\n0,1,20\n1,2,21\n"
+        yield gzip.compress(b"time_s,rack1_kW\n0,1\n1,2\n", mtime=0)
+    elif reader == "network":
+        yield b"from,to,weight\n1,2,1.0\n2,3,0.5\n"
+        yield b"%%MatrixMarket matrix coordinate real general\n2 2 1\n1 2 1.0\n"
+        yield b"%%MatrixMarket matrix array real general\n2 2\n0\n1\n1\n0\n"
+        yield (
+            b'<graphml xmlns="http://graphml.graphdrawing.org/xmlns"><graph edgedefault="directed">'
+            b'<node id="a"/><node id="b"/><edge source="a" target="b"/></graph></graphml>'
+        )
+    elif reader == "netcdf":
+        yield _netcdf()
+    elif reader == "snapshot":
+        path = _file("good.npz", b"")
+        Snapshot(3, {"x": np.ones((2, 2))}, {"sent": 1}, (b"state",)).save(path)
+        yield path.read_bytes()
+    elif reader == "facts":
+        yield b'{"method": "contraction", "K": [[1.0]], "E": [[0.5]], "certified": "yes"}'
+        yield b'{"verdict": "converged", "agents": [{"name": "1", "status": "converged"}]}'
     else:
         yield next(d for n, d in hostile.corpus.entries(2).items() if n.startswith("binaries/"))
+
+
+def _netcdf() -> bytes:
+    import h5netcdf
+
+    path = _file("good.nc", b"")
+    with h5netcdf.File(path, "w") as file:
+        file.dimensions = {"time": 2}
+        for name, unit in (("time", "s"), ("load", "W")):
+            variable = file.create_variable(name, ("time",), float, data=[0.0, 1.0])
+            variable.attrs["units"] = unit
+    return path.read_bytes()
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Any
 import attrs
 
 from posmas_fmi.errors import InputError
-from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry
+from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry, require_file
 from posmas_fmi.fmu.check.binaries import Binary, binary_findings, read_binaries
 from posmas_fmi.fmu.check.described import Described, Description, read_description
 from posmas_fmi.fmu.check.description import description_findings, strict_findings
@@ -136,8 +136,7 @@ def check_fmu(
     """
     path = Path(path)
     values = dict(values or {})
-    if not path.is_file():
-        raise InputError("expected an FMU (there is no such file)", str(path))
+    require_file(path)
     findings = examine(path, whole=True)
     if worst(findings) == "fatal":
         return Preflight(path, _ordered(findings))
