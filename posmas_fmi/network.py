@@ -288,7 +288,8 @@ def _gth(adjacency: Array) -> Array:
 
 
 def _power_iteration(adjacency: sp.csr_array, in_degree: Array) -> Array:
-    speed = 1.01 * in_degree.max()
+    # no eigenvalue of a step near -1: there rounding errors of either sign would not die out
+    speed = 1.5 * in_degree.max()
     step = sp.csr_array((adjacency.T + sp.diags_array(speed - in_degree)) / speed)
     f = np.full(len(in_degree), 1.0 / len(in_degree))
     for _ in range(1_000_000):

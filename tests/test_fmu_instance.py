@@ -330,9 +330,9 @@ def test_files_that_are_no_fmu(tmp_path: Path, temporary: Path, path: Path) -> N
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ArchiveError, match=name):
             FmuFile(tmp_path / name)
-    for missing in (tmp_path / "missing.fmu", tmp_path):
-        with pytest.raises(ArchiveError, match="no such file"):
-            FmuFile(missing)
+    for path, told in ((tmp_path / "missing.fmu", "no such file"), (tmp_path, "this is a folder")):
+        with pytest.raises(ArchiveError, match=told):
+            FmuFile(path)
     assert list(temporary.iterdir()) == []
 
 

@@ -4,7 +4,7 @@ import paper
 import pytest
 import scipy.io
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from posmas_fmi.errors import NetworkError
@@ -86,6 +86,7 @@ def test_perron_vector_is_the_left_null_vector(graph):
     np.testing.assert_allclose(f @ network.laplacian, 0.0, atol=1e-12)
 
 
+@example((2, [(1, 2, 3.75), (2, 1, 4.0)], 1))
 @settings(max_examples=20)
 @given(digraphs)
 def test_both_ways_to_the_perron_vector_agree(graph):
