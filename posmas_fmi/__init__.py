@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from posmas_fmi.fmu.build import agent_fmu
     from posmas_fmi.fmu.compare import regress
     from posmas_fmi.fmu.file import FmuFile
-    from posmas_fmi.network import Network, network_from_arcs, read_adjacency
+    from posmas_fmi.network import Network, network_from_arcs
+    from posmas_fmi.network_file import read_adjacency
     from posmas_fmi.report import write_report
     from posmas_fmi.scenario import Scenario, load, run
 
@@ -47,7 +48,7 @@ _PLACES = {
     "linear_agent": "agent",
     "load": "scenario",
     "network_from_arcs": "network",
-    "read_adjacency": "network",
+    "read_adjacency": "network_file",
     "regress": "fmu.compare",
     "run": "scenario",
     "write_report": "report",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import attrs
@@ -18,7 +16,6 @@ from posmas_fmi.errors import NetworkError
 from posmas_fmi.expression import Array
 
 LARGEST = 1_000_000  # agents
-LARGEST_FILE = 1_000_000_000  # bytes
 DENSE_LIMIT = 2000  # agents up to which dense O(N³) algorithms are used
 DIRECT_LIMIT = 300  # agents up to which a sparse factorisation is never too expensive
 
@@ -337,7 +334,7 @@ def network_from_arcs(
     """
     if agents < 1:
         raise NetworkError(f"expected at least one agent (got {agents})", "$.network.agents")
-    _check_size(agents, "$.network.agents")
+    check_size(agents, "$.network.agents")
     table = np.ones((len(arcs), 3))
     for k, arc in enumerate(arcs):
         if len(arc) not in (2, 3):
@@ -360,8 +357,8 @@ def network_from_arcs(
     return Network(adjacency, d, tuple(names))
 
 
-def _check_size(agents: int, where: str) -> None:
-    """Before anything is made that is as long."""
+def check_size(agents: int, where: str) -> None:
+    """Raise NetworkError for more agents than `LARGEST`, before anything as long is made."""
     if agents > LARGEST:
         raise NetworkError(f"expected at most {LARGEST} agents (got {str(agents)[:20]})", where)
 
@@ -389,146 +386,3 @@ def _check_arcs(table: Array, agents: int) -> None:
             f"the arc from {a:g} to {b:g} is there twice; give one with a weight",
             f"$.network.arcs[{repeated}]",
         )
-
-
-def read_adjacency(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
-    """Read a digraph from ``.csv`` (header ``from,to[,weight]``), ``.mtx`` or ``.graphml``.
-
-    Parameters
-    ----------
-    path : Path
-        In Matrix Market files row i lists whom agent i hears.
-
-    Returns
-    -------
-    adjacency : (N, N) sparse array
-    names : tuple of str
-        Node names, in the order of the rows.
-
-    Raises
-    ------
-    NetworkError
-        If the file cannot be read as a digraph.
-    """
-    readers = {".csv": _read_csv, ".mtx": _read_matrix_market, ".graphml": _read_graphml}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise NetworkError(
-            f"expected a .csv, .mtx or .graphml file (got {path.name})", "$.network.file"
-        )
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise NetworkError(
-                f"{path.name} is larger than {LARGEST_FILE:g} bytes", "$.network.file"
-            )
-        return reader(path)
-    except NetworkError:
-        raise
-    except Exception as error:  # whatever a foreign parser raises on a broken file
-        raise NetworkError(f"cannot read {path.name}: {error}", "$.network.file") from error
-
-
-def _read_csv(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
-    with path.open(newline="", encoding="utf-8") as stream:
-        rows = list(csv.reader(stream))
-    header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    if header not in (["from", "to"], ["from", "to", "weight"]):
-        raise NetworkError(
-            f"{path.name}, line 1: expected the header from,to or from,to,weight (got {header})",
-            "$.network.file",
-        )
-    arcs: list[tuple[str, str, float]] = []
-    for number, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        if len(row) != len(header):
-            raise NetworkError(
-                f"{path.name}, line {number}: expected {len(header)} columns (got {len(row)})",
-                "$.network.file",
-            )
-        arcs.append((row[0].strip(), row[1].strip(), float(row[2]) if len(row) == 3 else 1.0))
-    return _from_named_arcs(arcs)
-
-
-def _from_named_arcs(
-    arcs: Sequence[tuple[str, str, float]],
-) -> tuple[sp.csr_array, tuple[str, ...]]:
-    found = dict.fromkeys(end for a, b, _ in arcs for end in (a, b))
-    numeric = all(name.isdecimal() for name in found)
-    if numeric:
-        _check_size(max((int(n) for n in found), default=0), "$.network.file")
-    # numbers are agent numbers from 1: agents without an arc in between exist as well
-    names = (
-        tuple(str(k + 1) for k in range(max((int(n) for n in found), default=0)))
-        if numeric
-        else tuple(found)
-    )
-    index = {name: k for k, name in enumerate(names)}
-    if not arcs:
-        raise NetworkError("the file has no arcs", "$.network.file")
-    if numeric and "0" in found:
-        raise NetworkError("agents are numbered from 1 (got 0)", "$.network.file")
-    row, column = [index[b] for _, b, _ in arcs], [index[a] for a, _, _ in arcs]
-    weights = [w for _, _, w in arcs]
-    return sp.csr_array((weights, (row, column)), shape=(len(names), len(names))), names
-
-
-def _read_matrix_market(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
-    """Read it here: SciPy's reader ends the process on some broken files."""
-    with path.open(encoding="utf-8") as stream:
-        head = stream.readline().lower().split()
-        words = [w for line in stream if not line.startswith("%") for w in line.split()]
-    form, field, symmetry = head[2:5] if head[:2] == ["%%matrixmarket", "matrix"] else ("",) * 3
-    if (
-        form not in ("coordinate", "array")
-        or field not in ("real", "double", "integer", "pattern")
-        or symmetry not in ("general", "symmetric")
-    ):
-        raise NetworkError(
-            f"{path.name}, line 1: expected %%MatrixMarket matrix, coordinate or array, real, "
-            f"integer or pattern, general or symmetric (got {' '.join(head)[:60]!r})",
-            "$.network.file",
-        )
-    width = 3 if form == "coordinate" else 2
-    rows, columns, *_ = size = [int(word) for word in words[:width]]
-    _check_size(max(rows, columns), "$.network.file")
-    numbers = np.array(words[width:], dtype=float)
-    if form == "array":
-        full = rows * columns if symmetry == "general" else rows * (rows + 1) // 2
-        n = rows if numbers.size == full else 0
-        if symmetry == "general":
-            row, column = (k.ravel("F") for k in np.indices((n, columns if n else 0)))
-        else:  # the lower triangle, column by column
-            column, row = np.triu_indices(n)
-        values, said, each = numbers, full, 1
-    else:
-        table = numbers[: numbers.size - numbers.size % (each := 2 + (field != "pattern"))]
-        table = table.reshape(-1, each)
-        row, column = table[:, 0].astype(int) - 1, table[:, 1].astype(int) - 1
-        values = table[:, 2] if each == 3 else np.ones(len(table))
-        said = size[2]
-    if numbers.size != said * each:
-        raise NetworkError(f"{path.name} has fewer numbers than it says, or more", "$.network.file")
-    if symmetry == "symmetric":
-        apart = row != column
-        row, column, values = (
-            np.concatenate([row, column[apart]]),
-            np.concatenate([column, row[apart]]),
-            np.concatenate([values, values[apart]]),
-        )
-    matrix = sp.csr_array((values, (row, column)), shape=(rows, columns))
-    return matrix, tuple(str(k + 1) for k in range(rows))
-
-
-def _read_graphml(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
-    import networkx
-
-    graph = networkx.read_graphml(path)
-    nodes = list(graph.nodes)
-    arcs = [(str(a), str(b), float(w)) for a, b, w in graph.edges(data="weight", default=1.0)]
-    if not graph.is_directed():
-        arcs += [(b, a, w) for a, b, w in arcs]
-    index = {str(name): k for k, name in enumerate(nodes)}
-    row, column = [index[b] for _, b, _ in arcs], [index[a] for a, _, _ in arcs]
-    matrix = sp.csr_array(([w for *_, w in arcs], (row, column)), shape=(len(nodes), len(nodes)))
-    return matrix, tuple(str(n) for n in nodes)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from posmas_fmi.cooling.loads import read_loads
 from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import InputError, NetworkError
-from posmas_fmi.network import read_adjacency
+from posmas_fmi.network_file import read_adjacency
 from posmas_fmi.report.json_files import read_json
 from posmas_fmi.scenario import load
 

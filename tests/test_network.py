@@ -14,8 +14,8 @@ from posmas_fmi.network import (
     _power_iteration,
     generalised_connectivity,
     network_from_arcs,
-    read_adjacency,
 )
+from posmas_fmi.network_file import read_adjacency
 
 
 def test_spectra_of_the_papers_graphs():

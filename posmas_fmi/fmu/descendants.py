@@ -61,15 +61,3 @@ def _marked(entry: bytes) -> Iterator[int]:
         with suppress(OSError):  # it has ended, or is another user's
             if entry in (place / "environ").read_bytes().split(b"\0"):
                 yield process
-
-
-def size_of(folder: Path, enough: float) -> int:
-    """Bytes in the files of a folder, counted until there are more than enough."""
-    total = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            with suppress(OSError):
-                total += os.lstat(os.path.join(place, name)).st_blocks * 512
-            if total > enough:
-                return total
-    return total

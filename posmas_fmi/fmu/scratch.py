@@ -61,6 +61,18 @@ def sweep() -> list[Path]:
     return gone
 
 
+def size_of(folder: Path, enough: float) -> int:
+    """Bytes in the files of a folder, counted until there are more than enough."""
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += os.lstat(os.path.join(place, name)).st_blocks * 512
+            if total > enough:
+                return total
+    return total
+
+
 def _abandoned(folder: Path) -> bool:
     try:
         handle = os.open(folder / _LOCK, os.O_RDWR)

@@ -19,7 +19,8 @@ from posmas_fmi.cosim.conditions import Sensors, steps_of
 from posmas_fmi.design import DesignSettings
 from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.expression import Array, VectorFunction, parse
-from posmas_fmi.network import Network, network_from_arcs, read_adjacency
+from posmas_fmi.network import Network, network_from_arcs
+from posmas_fmi.network_file import read_adjacency
 from posmas_fmi.scenario.faults import make_episodes
 from posmas_fmi.scenario.paths import Named, data_files, leaving
 from posmas_fmi.scenario.reading import read_tables

@@ -24,7 +24,7 @@ from posmas_fmi.fmu.check.image import ImageError, read_image
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.xml import scan
 from posmas_fmi.fmu.compare import read_reference
-from posmas_fmi.network import read_adjacency
+from posmas_fmi.network_file import read_adjacency
 from posmas_fmi.report.json_files import design_facts, read_json, summary_facts
 from posmas_fmi.scenario import load
 from posmas_fmi.scenario.signals import read_signal

@@ -14,7 +14,8 @@ from pathlib import Path
 import attrs
 
 from posmas_fmi.cosim.worker.layout import Head
-from posmas_fmi.fmu.descendants import MARK, end_marked, size_of
+from posmas_fmi.fmu.descendants import MARK, end_marked
+from posmas_fmi.fmu.scratch import size_of
 
 LOOK = 100  # ms between two looks
 KEPT = 1 << 20  # bytes of output that are kept

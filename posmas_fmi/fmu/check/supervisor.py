@@ -24,7 +24,8 @@ from posmas_fmi.fmu.archive import unpack
 from posmas_fmi.fmu.check.board import Board
 from posmas_fmi.fmu.check.finding import Finding
 from posmas_fmi.fmu.check.surroundings import handles_of, resident_of
-from posmas_fmi.fmu.descendants import MARK, new_mark, size_of
+from posmas_fmi.fmu.descendants import MARK, new_mark
+from posmas_fmi.fmu.scratch import size_of
 
 PARTS = ("life", "reset", "rollback", "second", "leaks", "unload")
 CONTROL = ("control",)
