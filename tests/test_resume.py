@@ -132,6 +132,9 @@ def test_what_cannot_go_on(tmp_path: Path) -> None:
     run(definition, out, report=False)
     with pytest.raises(InputError, match="complete"):
         run(definition, out, report=False, resume=True)
+    for between in (0.251, np.nan, np.inf):
+        with pytest.raises(InputError, match="no snapshot at"):
+            run(definition, tmp_path / "b", report=False, branch=(out, between))
     with pytest.raises(InputError, match=r"no snapshot at 0\.3 s \(there is: 0\.25, 0\.5"):
         run(definition, tmp_path / "b", report=False, branch=(out, 0.3))
     run(definition, out, interrupted(150), report=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +103,10 @@ def branched(scenario: Scenario, folder: Path, at: float) -> Beginning:
             f"that run has the period {before.get('period')} s (here it is {scenario.clock.h:g} s)",
             str(folder),
         )
-    k = round(at / scenario.clock.h)
+    h = scenario.clock.h
+    k = round(at / h) if math.isfinite(at) else -1
     path = folder / FOLDER / f"{k}.npz"
-    if not path.is_file():
+    if not path.is_file() or abs(at - scenario.clock.time(k)) > 1e-6 * h:
         known = sorted(int(p.stem) for p in (folder / FOLDER).glob("*.npz") if p.stem.isdigit())
         times = ", ".join(f"{scenario.clock.time(n):g}" for n in known[:20]) or "none"
         raise InputError(
