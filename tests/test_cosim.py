@@ -140,9 +140,19 @@ def test_time_does_not_drift():
     assert clock.time(3) == 0.3  # the sum 0.1 + 0.1 + 0.1 is not
 
 
+@pytest.mark.parametrize("parts", [3, 7, 60, 44_100])
+def test_a_period_may_be_a_fraction_of_a_second(parts):
+    """A display or a container of FMUs has steps of 1/60 s, which is no number of nanoseconds."""
+    clock = Clock.of(until=3600.0, period=1 / parts)
+    assert (clock.h, clock.steps, clock.time(3600 * parts)) == (1 / parts, 3600 * parts, 3600.0)
+    assert clock.time(parts // 2) == (parts // 2) / parts
+    with pytest.raises(InputError, match="multiple of the period"):
+        Clock.of(until=1.0 + 0.4 / parts, period=1 / parts)
+
+
 @pytest.mark.parametrize(
     ("until", "period", "place"),
-    [(1.0, 0.3, "until"), (0.1, 0.2, "until"), (1.0, 1e-10, "period"), (1.0, 1 / 3, "period")],
+    [(1.0, 0.3, "until"), (0.1, 0.2, "until"), (1.0, 1e-10, "period"), (1.0, np.pi / 9, "period")],
 )
 def test_periods_that_do_not_fit_are_refused(until, period, place):
     with pytest.raises(InputError) as caught:

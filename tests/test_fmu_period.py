@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import test_engine
 from fmu_examples import tank_fmu
 from fmu_scenarios import one_fmu
 from test_fmu_instance import described
@@ -100,3 +101,35 @@ def test_a_scenario_is_refused_before_anything_runs(
 def test_a_scenario_with_a_period_that_is_allowed_runs(fixed: Path, tmp_path: Path) -> None:
     path = one_fmu(tmp_path, fixed, '"power"', '"temperature"', period=0.3, until=3.0)
     assert run(load(path), tmp_path / "out", report=False).summary["steps"] == 10
+
+
+EXACT = """    if (communicationStepSize != 1.0 / 60 ||
+        currentCommunicationPoint != rint(currentCommunicationPoint * 60) / 60)
+        return fmi3Error;
+"""
+
+
+@pytest.fixture
+def container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An FMU of 60 Hz that takes its own points of time only, to the last bit."""
+    test_engine.changed(monkeypatch, 3, test_engine.STEP, EXACT + test_engine.STEP)
+    new = VARIABLE.replace(b"true", b"false") + b' fixedInternalStepSize="0.016666666666666666"'
+    return described(tank_fmu(tmp_path, 3), tmp_path / "container.fmu", VARIABLE, new)
+
+
+@pytest.mark.parametrize("isolation", ["none", "process"])
+@pytest.mark.parametrize("which", ["c", "numpy"])
+def test_an_fmu_gets_its_points_of_time_to_the_last_bit(
+    container: Path, tmp_path: Path, which: str, isolation: str
+) -> None:
+    ports = (container, '"power"', '"temperature"', f'isolation = "{isolation}"')
+    path = one_fmu(tmp_path, *ports, period=1 / 60, until=10.0, engine=which)
+    summary = run(load(path), tmp_path / "out", report=False).summary
+    assert (summary["steps"], summary["verdict"]) == (600, "converged")
+
+
+def test_the_nearest_period_is_told_with_all_digits(container: Path) -> None:
+    with FmuFile(container) as file:
+        reason = check_period(file, 0.016666667).reason
+    assert "0.016666667 s is no whole multiple" in reason
+    assert "the nearest is 0.016666666666666666 s" in reason

@@ -14,7 +14,6 @@ import numpy as np
 
 from posmas_fmi.cosim import native
 from posmas_fmi.cosim.channel import Arrivals
-from posmas_fmi.cosim.clock import TICKS_PER_SECOND
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.fmus import READING, Incident, Report
 from posmas_fmi.cosim.law import CompiledLaw, Law, ProtocolLaw, Weights
@@ -243,7 +242,7 @@ class _Engine(ctypes.Structure):
         ("every", _pointer),
         ("own_values", _pointer),
         ("steps", _int),
-        ("period", _int),
+        *(("period", _int), ("per_second", _int)),
         ("shows_states", _int),
         ("all_arcs", _int),
         ("first_arc", _pointer),
@@ -374,7 +373,7 @@ class Engine:
         network, law, N = system.network, self._law, system.network.N
         # the first is the leader's, who moves at every communication point
         every, period_of = np.unique(np.append(system.every, 1), return_inverse=True)
-        tick = system.clock.period / TICKS_PER_SECOND
+        tick = system.clock.h
         constants = [law.constants(int(steps) * tick) for steps in every]
         if library.engine_controller_size() != constants[0].nbytes:
             raise BuildError("the engine's library was made for controllers of other sizes")
@@ -383,7 +382,8 @@ class Engine:
         self._point("every", system.every, np.int64)
         self._point("own_values", law.own_values)
         e.fmus, e.agents = self._plant.fmus.address, N
-        e.steps, e.period = system.clock.steps, system.clock.period
+        clock = system.clock
+        e.steps, e.period, e.per_second = clock.steps, clock.period, clock.per_second
         e.shows_states = self._plant.shows_states
         e.all_arcs = network.adjacency.nnz + len(network.pinned)
         e.resolution = system.channel.resolution

@@ -12,7 +12,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.channel import Channel, Mailbox
-from posmas_fmi.cosim.clock import TICKS_PER_SECOND, Clock
+from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.conditions import Episode, Sensors, Timeline, rounded
 from posmas_fmi.cosim.failure import Failure
 from posmas_fmi.cosim.law import Heard, Law, Weights, columns
@@ -349,7 +349,7 @@ class Run:
         is_u = np.zeros(plant.input_at[-1], dtype=bool)
         is_u[self.u_at] = True
         self.extra_at = np.flatnonzero(~is_u)
-        self.lengths = system.every * system.clock.period / TICKS_PER_SECOND  # of the steps [s]
+        self.lengths = system.clock.times(system.every)  # of the steps [s]
         self.everyone = np.arange(system.instances)
         self.in_step = bool((system.every == 1).all())  # every period is one communication step
         self.all_act = self.in_step  # and none is frozen
@@ -540,7 +540,7 @@ class Run:
         if k == 0:
             mailbox.held = message
         received = mailbox.exchange(k, message, self.conditions.loss if self.always_draws else None)
-        age = mailbox.age(k) * self.system.clock.period / TICKS_PER_SECOND
+        age = self.system.clock.times(mailbox.age(k))
         np.maximum.at(silence[:, 0], self.receivers, age[: self.arcs])
         silence[pinned, 1] = age[self.arcs :]
         return Heard(received[: self.arcs], self.held, received[self.arcs :], pinned, silence)
@@ -552,7 +552,7 @@ class Run:
             mine = of_period if self.all_act else of_period & ~self.plant.frozen[: len(sent)]
             if k % period or not (self.all_act or mine.any()):
                 continue
-            h = period * system.clock.period / TICKS_PER_SECOND
+            h = system.clock.time(period)
             decision = system.law.step(
                 t, h, state.measured, sent, heard, state.memory, self.weights, state.leader
             )
@@ -633,7 +633,7 @@ class Run:
                 continue
             t = np.full(len(ends), clock.time(k))
             if not self.in_step:
-                t = (k + 1 - system.every[ends]) * clock.period / TICKS_PER_SECOND
+                t = clock.times(k + 1 - system.every[ends])
             lengths = self.lengths if len(ends) == len(self.lengths) else self.lengths[ends]
             self.plant.step(ends, t, lengths, state.inputs, latest)
             state.k = k + 1  # a reading that fails belongs to the next point

@@ -94,8 +94,8 @@ def check_period(file: FmuFile | About, period: float, *, last: float | None = N
             nearest = float(Fraction(repr(fixed)) * whole)
             return PeriodCheck(
                 False,
-                f"its solver has steps of {fixed:g} s, and {length:g} s is no whole multiple of "
-                f"them; the nearest is {nearest:g} s",
+                f"its solver has steps of {_written(fixed)} s, and {_written(length)} s is no "
+                f"whole multiple of them; the nearest is {_written(nearest)} s",
                 nearest,
             )
     different = last is not None and abs(last - period) > _SAME * period
@@ -124,7 +124,8 @@ def _ticks_at_points(file: FmuFile | About, period: float) -> PeriodCheck:
             return PeriodCheck(
                 False,
                 f"its clock {clock.name!r} ticks every {interval:g} s, between communication "
-                f"points, and it takes no steps of different length; the nearest is {nearest:g} s",
+                "points, and it takes no steps of different length; the nearest is "
+                f"{_written(nearest)} s",
                 nearest,
             )
     return PeriodCheck(True)
@@ -151,6 +152,11 @@ def _interface(file: FmuFile | About) -> Any:
 def _multiple(length: float, unit: float) -> bool:
     ratio = length / unit
     return round(ratio) >= 1 and abs(ratio - round(ratio)) <= _SAME * ratio
+
+
+def _written(time: float) -> str:
+    """Return a time as one may copy it: all digits where fewer are another time."""
+    return f"{time:g}" if float(f"{time:g}") == time else repr(time)
 
 
 def _number(given: Any) -> float | None:

@@ -47,8 +47,9 @@ class ScenarioTable:
     until : float
         End of the run [s]; a multiple of `period`.
     period : float
-        Control period = communication step [s], whole nanoseconds. Refused where an FMU does not
-        allow it, with the nearest that it allows.
+        Control period = communication step [s]: whole nanoseconds, or a fraction of a second to all
+        of its digits (0.016666666666666666 is 1/60). Refused where an FMU does not allow it, with
+        the nearest that it allows.
     seed : int
         Of every random number of the run.
     tolerance : float

@@ -111,13 +111,13 @@ static const Controller *controller(const Engine *e, int64_t i)
 
 static double time_of(const Engine *e, int64_t k)
 {
-    return (double)(k * e->period) / 1e9;
+    return (double)(k * e->period) / (double)e->per_second;
 }
 
 /* The step of an instance [s] from the nominal period, never from differences of times. */
 static double step_of(const Engine *e, int64_t i)
 {
-    return (double)(e->every[i] * e->period) / 1e9;
+    return (double)(e->every[i] * e->period) / (double)e->per_second;
 }
 
 static void copy(double *to, const double *from, int64_t n)
@@ -190,8 +190,8 @@ FOR_EACH_AGENT void gather(const Engine *e, const Point *p, int64_t i, double *d
         for (int j = 0; j < FIRST; j++)
             disagreement[j] -= e->leader[i] * s[j];
     }
-    silence[0] = (double)(oldest * e->period) / 1e9;
-    silence[1] = (double)(from_leader * e->period) / 1e9;
+    silence[0] = time_of(e, oldest);
+    silence[1] = time_of(e, from_leader);
 }
 
 /* Take what arrives for agent i at a point at which it does not act. */
@@ -666,7 +666,7 @@ static void run(Member *me)
     const Engine *e = team->e;
     Point p = {.k = e->k,
                .t = time_of(e, e->k),
-               .h = (double)e->period / 1e9,
+               .h = time_of(e, 1),
                .arrivals = e->arrivals,
                .here = place(e, e->k, 0),
                .next = place(e, e->k + 1, 1)};

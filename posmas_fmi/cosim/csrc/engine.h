@@ -22,7 +22,8 @@ typedef struct {
     const int64_t *every;       /* (instances) its period, in communication steps */
     const double *own_values;   /* (agents, OWN) */
     int64_t steps;              /* communication steps in all */
-    int64_t period;             /* [ns] */
+    int64_t period;             /* [ticks] */
+    int64_t per_second;         /* ticks */
     int64_t shows_states;       /* whether the agents' FMUs show x */
 
     /* the digraph */
