@@ -73,6 +73,18 @@ MISTAKES = {
         ["$.plant.override[0].agent"],
         "1 to 4",
     ),
+    "two overrides": (
+        "[leader]",
+        2 * "[[plant.override]]\nagent = 3\n" + "[leader]",
+        ["$.plant.override[1].agent"],
+        "agent 3 is in $.plant.override[0] already",
+    ),
+    "two tables of an arc": (
+        "[leader]",
+        2 * "[[channel.arc]]\narc = [2, 1]\n" + "[leader]",
+        ["$.channel.arc[1].arc"],
+        "arc [2, 1] is in $.channel.arc[0] already",
+    ),
     "not TOML": ("[scenario]", "[scenario", [], "TOML"),
 }
 

@@ -87,9 +87,10 @@ def read_tables(
     if isinstance(head, dict):
         head |= instead or {}
     converter = _converter()
+    problems = _repeated(document)  # what [cooling] stands for may be said again
     if "cooling" in document:
         document = _expand(document, converter, path, outside)
-    problems = _design_problems(document.get("design"))
+    problems += _design_problems(document.get("design"))
     try:
         tables = converter.structure(document, ScenarioFile)
     except (ClassValidationError, IterableValidationError) as error:
@@ -169,6 +170,25 @@ def merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 def _tables(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
+
+
+def _repeated(document: dict[str, Any]) -> list[tuple[str, str]]:
+    """Tables of a list that are about the same agent or arc as one before them."""
+    problems = []
+    for table, name, key in (("plant", "override", "agent"), ("channel", "arc", "arc")):
+        first: dict[str, str] = {}
+        whole = document.get(table)
+        entries = whole.get(name) if isinstance(whole, dict) else None
+        for k, entry in enumerate(entries if isinstance(entries, list) else ()):
+            if not isinstance(entry, dict) or key not in entry:
+                continue
+            place, what = f"$.{table}.{name}[{k}]", f"{key} {_show(entry[key])}"
+            before = first.setdefault(what, place)
+            if before != place:
+                problems.append(
+                    (f"{place}.{key}", f"{what} is in {before} already; write both as one")
+                )
+    return problems
 
 
 def _design_problems(table: Any) -> list[tuple[str, str]]:
