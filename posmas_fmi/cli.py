@@ -115,9 +115,10 @@ def _run(arguments: argparse.Namespace) -> int:
     summary = result.summary
     if arguments.json:
         _print_json({**summary, "certified": result.certified, "folder": str(folder)})
-    elif summary["verdict"] == "compared" and "kpi" in summary:
+    elif scenario.compare is not None:
         _show_comparison(summary)
-        print(f"report     {folder / 'report.html'}")
+        for page in _pages(folder, list(summary["comparison"])):
+            print(f"report     {page}")
     else:
         print(f"verdict    {summary['verdict']}")
         if summary["reason"]:
@@ -340,17 +341,31 @@ def _show_reach(made: Design) -> None:
 def _show_comparison(summary: dict[str, Any]) -> None:
     """Key figures by controller, then which limits each of them breaks."""
     found = summary["comparison"]
-    labels = {
-        k: f"{v['label']} [{v['unit']}]".removesuffix(" []") for k, v in summary["kpi"].items()
-    }
+    if summary["verdict"] != "compared":
+        print(f"verdict    {summary['verdict']} ({summary['reason']})")
+    labels = {"tracking_error_final": "error to the leader at the end", "min_state": "min state"}
+    if "kpi" in summary:
+        labels = {
+            k: f"{v['label']} [{v['unit']}]".removesuffix(" []") for k, v in summary["kpi"].items()
+        }
     width = max(map(len, labels.values()))
     print(" " * width + "".join(f"  {name:>12}" for name in found))
     for key, label in labels.items():
         cells = (_number(figures.get(key)) for figures in found.values())
         print(f"{label:{width}}" + "".join(f"  {cell:>12}" for cell in cells))
     for name, figures in found.items():
+        if "limits" not in figures:
+            print(f"{name}: {figures['verdict']}")
+            continue
         broken = [limit for limit, kept in figures.get("limits", {}).items() if kept is False]
         print(f"{name}: {'breaks ' + ', '.join(broken) if broken else 'keeps every limit'}")
+
+
+def _pages(folder: Path, controllers: list[str]) -> list[Path]:
+    """Return the report of a comparison, or where it has none those of its controllers."""
+    page = folder / "report.html"
+    of_each = [folder / name / "report.html" for name in controllers]
+    return [page] if page.is_file() else [one for one in of_each if one.is_file()]
 
 
 def _show_linearisation(made: Linearisation) -> None:

@@ -22,7 +22,9 @@ from posmas_fmi.cosim.wiring import Extra, Term, Wiring
 from posmas_fmi.errors import InputError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
+from posmas_fmi.scenario.compare import together
 from posmas_fmi.scenario.job import scheduled
+from posmas_fmi.scenario.tables import CompareTable
 
 H, STEPS = 0.1, 20
 DECAY = np.exp(-H)
@@ -126,9 +128,17 @@ offset = 10.0
 """
     engine = 'auto"\ncoupling = "iterate'
     path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more, engine=engine)
-    summary = run(load(path), tmp_path / "out", report=False).summary
+    made = run(load(path), tmp_path / "out", report=False)
+    summary = made.summary
     assert summary["unsettled_steps"] == unsettled
     assert ("did not settle in 10 of 10 steps" in summary["reason"]) == bool(unsettled)
+    assert made.certified == "yes"
+    assert {agent["status"] for agent in summary["agents"]} == {"converged"}
+    assert summary["verdict"] == ("not settled" if unsettled else "converged")
+    assert made.good is not bool(unsettled)  # the exit code
+    both = together({"a": {**summary, "unsettled_steps": 0}, "b": summary}, CompareTable(["a"]))
+    assert both["verdict"] == ("not settled" if unsettled else "compared")
+    assert both["reason"] == ("b: not settled" if unsettled else "")
     if not unsettled:
         with xr.open_dataset(tmp_path / "out" / "results.nc") as found:
             power, net = found["hall.power"].values[1:], found["hall.net"].values[1:]

@@ -151,6 +151,7 @@ def test_diverged_run_says_who_was_lost_and_when(tmp_path: Path) -> None:
     ("verdict", "complete", "expected"),
     [
         ("not converged", 1, "Not converged: the largest tracking error is"),
+        ("not settled", 1, "Not settled: the largest tracking error is"),
         ("positivity lost", 1, "Positivity is lost (lowest state −0.4), the tracking error is"),
         ("failed", 0, "An FMU failed at t = 0.5 s"),
         ("cancelled", 0, "The run was cancelled at t = 0.5 s: the largest tracking error was"),
@@ -172,6 +173,7 @@ def test_every_verdict_of_the_master_is_put_into_words(
     text = _Page(page_of(tmp_path)).text
     assert expected in text
     assert "Agent 3: doStep returned Error." in text
+    assert ("another coupling, before judging it" in text) == (verdict == "not settled")
     assert "0.123" in text
     assert "no state became negative" not in text or verdict != "positivity lost"
 

@@ -144,6 +144,11 @@ def advice(run: Run) -> str:
         )
     if not run.complete:
         return "Run it again to the end before judging it."
+    if run.summary.verdict == "not settled":
+        return (
+            "The FMUs act on each other too strongly within a step for the iteration: take a "
+            "shorter period, or another coupling, before judging it."
+        )
     if design.certified == "no":
         return (
             "One simulated run is not a proof: another start, load or delay may behave otherwise. "

@@ -31,6 +31,7 @@ from posmas_fmi.scenario.tables import CompareTable, ControlTable
 
 _LOOK = 0.2  # s between two looks at the runs
 PRACTICE = "pi"
+ENDED = ("failed", "cancelled", "diverged")  # before the end of the run
 
 
 def controllers(scenario: Scenario) -> dict[str, ControlTable]:
@@ -199,12 +200,13 @@ def together(summaries: dict[str, dict[str, Any]], compare: CompareTable) -> dic
     Returns
     -------
     dict
-        ``verdict`` is ``compared``, or what kept a run from its end.
+        ``verdict`` is ``compared``, or what kept a run from its end, or from being one of the
+        coupled system.
     """
     stopped = [
-        (name, one["verdict"])
+        (name, one["verdict"] if one["verdict"] in ENDED else "not settled")
         for name, one in summaries.items()
-        if one["verdict"] in ("failed", "cancelled", "diverged")
+        if one["verdict"] in ENDED or one.get("unsettled_steps")
     ]
     first = next(iter(summaries.values()))
     shared = ("kpi", "limits", "facility_K", "band_K", "scenario", "created_by", "faults")

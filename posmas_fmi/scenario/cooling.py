@@ -36,6 +36,7 @@ from posmas_fmi.scenario.tables import (
     ScenarioTable,
     SignalTable,
 )
+from posmas_fmi.scenario.verdict import overall
 
 if TYPE_CHECKING:
     from posmas_fmi.scenario.build import Scenario
@@ -549,8 +550,7 @@ def judge(
             agent["status"] = _status(agent)
     statuses = [agent["status"] for agent in summary["agents"]]
     if outcome.ended in ("complete", "terminated"):
-        order = ("positivity lost", "not converged")
-        summary["verdict"] = next((s for s in order if s in statuses), "converged")
+        summary["verdict"] = overall(statuses, outcome.unsettled)
     summary |= {
         "tracking_error_final": float(final.max()),
         "min_state": figures.lowest,

@@ -24,8 +24,9 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
     Returns
     -------
     dict
-        ``verdict`` is one of ``converged``, ``not converged``, ``positivity lost``, ``diverged``,
-        ``failed``, ``cancelled``. ``ended`` tells how the run ended; ``terminated``: an FMU asked
+        ``verdict`` is one of ``converged``, ``not settled`` (it would be converged, but the
+        iteration of coupled FMUs did not settle in every step), ``not converged``,
+        ``positivity lost``, ``diverged``, ``failed``, ``cancelled``. ``ended`` tells how the run ended; ``terminated``: an FMU asked
         for it, and the verdict is about the state by then.
     """
     agents = [
@@ -40,13 +41,14 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         }
         for k, name in enumerate(names)
     ]
+    reasons = (_frozen_reason(outcome), _unsettled_reason(outcome))
     noise, iterated = outcome.replay_noise, outcome.replay_noise is not None
     return {
         **({} if noise is None else {"replay_noise": _finite(noise)}),
         **({"unsettled_steps": outcome.unsettled} if iterated else {}),
         "verdict": _verdict(outcome, [str(agent["status"]) for agent in agents]),
         "ended": outcome.ended,
-        "reason": outcome.reason or _frozen_reason(outcome) or _unsettled_reason(outcome),
+        "reason": outcome.reason or "; ".join(filter(None, reasons)),
         "agents": agents,
         "tracking_error_final": _finite(outcome.tracking_error.max()),
         "estimation_error_final": _finite(outcome.estimation_error.max()),
@@ -75,10 +77,30 @@ def _status(outcome: Outcome, k: int, name: str, tolerance: float) -> str:
 def _verdict(outcome: Outcome, statuses: list[str]) -> str:
     if outcome.ended in ("diverged", "failed", "cancelled"):
         return outcome.ended
+    return overall(statuses, outcome.unsettled)
+
+
+def overall(statuses: list[str], unsettled: int = 0) -> str:
+    """Verdict on a run that came to its end.
+
+    Parameters
+    ----------
+    statuses : list of str
+        Of the agents.
+    unsettled : int
+        Steps in which the iteration of coupled FMUs did not settle.
+
+    Examples
+    --------
+    >>> overall(["converged", "frozen"]), overall(["converged"], unsettled=1)
+    ('not converged', 'not settled')
+    """
     for status in ("diverged", "positivity lost", "not converged"):
         if status in statuses:
             return status
-    return "not converged" if "frozen" in statuses else "converged"
+    if "frozen" in statuses:
+        return "not converged"
+    return "not settled" if unsettled else "converged"
 
 
 def _frozen_reason(outcome: Outcome) -> str:
