@@ -43,7 +43,7 @@ SCENARIO is a file or the name of a shipped scenario, see `posmas-fmi models`.
 | exit code | meaning |
 |---|---|
 | 0 | done, and the verdict is good |
-| 1 | the verdict is not good: not certified, not converged, diverged, outside the band, or coupled FMUs did not settle in every step (`not settled`) |
+| 1 | the verdict is not good: not certified, not converged, diverged, not settled, outside band |
 | 2 | bad input: the message says where and what to do |
 | 3 | an FMU failed or cannot be used |
 | 130 | cancelled |

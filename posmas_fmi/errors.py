@@ -63,6 +63,7 @@ class ScenarioError(InputError):
         lines = [f"{place}: {text}" for place, text in problems]
         message = lines[0] if len(lines) == 1 else "\n  ".join([f"{len(lines)} problems", *lines])
         super().__init__(message, where)
+        self.args = (problems, where)  # what a copy from another process is made of
         self.problems = problems
 
 

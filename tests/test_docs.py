@@ -135,6 +135,28 @@ def test_the_short_scenario_of_the_page_is_whole(tmp_path):
     assert posmas_fmi.load(path).network.N == 3
 
 
+def test_the_controller_of_the_page_runs_and_its_failure_is_told(tmp_path, capsys):
+    text = (ROOT / "docs" / "scenario.md").read_text(encoding="utf-8")
+    short, law = (re.search(rf"```{kind}\n(.*?)```", text, re.S)[1] for kind in ("toml", "python"))
+    path, out = tmp_path / "tanks.toml", tmp_path / "out"
+    path.write_text(
+        f'{short}\n[control]\npython = "follow.py:Follow"\nparameters = {{gain = 4.0}}\n'
+        "[report]\nbaseline = false\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "follow.py").write_text(law, encoding="utf-8")
+    made = posmas_fmi.run(posmas_fmi.load(path, until=10.0), out)
+    assert made.summary["verdict"] == "converged"
+    (uncovered,) = made.summary["coverage"]
+    assert not uncovered["covered"]
+    law = law.replace("target = ", "t > 0.95 and 1 / 0\n        target = ")
+    (tmp_path / "follow.py").write_text(law, encoding="utf-8")
+    assert cli.main(["run", str(path), "--out", str(out)]) == 2
+    assert "step of agent 1 at t = 1 s: ZeroDivisionError" in capsys.readouterr().err
+    assert cli.main(["report", str(out)]) == 0
+    assert "cut off at t = 0.9 s" in (out / "report.html").read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("block", range(4))
 def test_the_tables_of_the_scenario_page_are_known(block, generated):
     import tomllib

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 
@@ -12,10 +13,11 @@ from posmas_fmi.agent import linear_agent
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.conditions import Episode
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System, simulate
 from posmas_fmi.cosim.plant import ModelPlant
-from posmas_fmi.cosim.python_law import PythonLaw, load_class
+from posmas_fmi.cosim.python_law import PythonLaw, load_class, make
 from posmas_fmi.errors import InputError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
@@ -108,14 +110,150 @@ def test_one_controller_for_all() -> None:
     np.testing.assert_allclose(rows["u"], 2.0 * (rows["s"][:, None] - rows["y"]))
 
 
-@pytest.mark.parametrize("answer", [[1.0, 2.0], "x", None, np.nan])
-def test_answers_that_are_no_input_name_the_agent(answer: Any) -> None:
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        ([1.0, 2.0], r"expected 1 number \(got \[1.0, 2.0\]\)"),
+        ("x", "expected 1 number .got 'x'"),
+        (None, "expected 1 number .got None: is there a return"),
+        (np.nan, "expected 1 number, finite .got nan"),
+    ],
+)
+def test_answers_that_are_no_input_name_agent_and_time(answer: Any, told: str) -> None:
     class Wrong:
-        def step(self, *_: Any) -> Any:
-            return answer
+        def step(self, t: float, *_: Any) -> Any:
+            return answer if t > 0.15 else 0.0
 
-    with pytest.raises(InputError, match="step of agent 1"):
+    with pytest.raises(InputError, match="step of agent 1 at t = 0.2 s: " + told):
         rows_of(PythonLaw(AGENT, NETWORK, [Wrong()] * 3))
+    with pytest.raises(InputError, match=r"control.python: step_all at t = 0.2 s: expected 3 num"):
+        rows_of(PythonLaw(AGENT, NETWORK, All(Wrong())))
+
+
+class All:
+    def __init__(self, one: Any) -> None:
+        self.one = one
+
+    def step_all(self, t: float, Y: np.ndarray, s: Any) -> Any:
+        answer = self.one.step(t)
+        return np.zeros(3) if answer == 0.0 else answer
+
+
+@pytest.mark.parametrize("error", ["1 / 0", "raise SystemExit(0)", "{}['a']"])
+def test_what_a_controller_raises_names_agent_time_and_line(tmp_path: Path, error: str) -> None:
+    text = f"""
+class Mine:
+    def __init__(self, number, fails):
+        self.number, self.fails = number, fails
+        if number == fails == 1:
+            {error}
+
+    def step(self, t, y, neighbours, s):
+        if self.number == self.fails and t > 0.15:
+            {error}
+        return 0.0
+"""
+    (tmp_path / "mine.py").write_text(text)
+    kind = {"1": "ZeroDivisionError", "r": "SystemExit", "{": "KeyError"}[error[0]]
+    made = load_class("mine.py:Mine", tmp_path)
+    with pytest.raises(InputError, match=rf"cannot be made: {kind}.*\(mine.py, line 6\)"):
+        make(made, 1, fails=1)
+    with pytest.raises(InputError, match=r"cannot be made: TypeError: .*'fials'"):
+        make(made, 1, fials=1)
+    law = PythonLaw(AGENT, NETWORK, [make(made, k, fails=2) for k in (1, 2, 3)])
+    told = rf"step of agent 2 at t = 0.2 s: {kind}.*\(mine.py, line 10\)"
+    with pytest.raises(InputError, match=told):
+        rows_of(law)
+    (tmp_path / "mine.py").write_text(f"import math\n{error}\n")
+    with pytest.raises(InputError, match=rf"mine.py cannot be run: {kind}.*\(mine.py, line 2\)"):
+        load_class("mine.py:Mine", tmp_path)
+
+
+def test_arguments_are_checked_before_anything_runs() -> None:
+    class Short:
+        def step(self, t: float, y: np.ndarray) -> float:
+            return 0.0
+
+    class Silent:
+        def step(self, t: float, y: np.ndarray, neighbours: np.ndarray, s: Any) -> float:
+            return 0.0
+
+        def message(self, y: np.ndarray) -> float:
+            return 0.0
+
+    for kind, told in (
+        (Short, r"step\(t, y, neighbours, s\), self not counted \(got step\(t: .*, y: "),
+        (Silent, r"message\(t, y\), self not counted \(got message\(y: "),
+    ):
+        with pytest.raises(InputError, match=told):
+            PythonLaw(AGENT, NETWORK, [kind(), kind(), kind()])
+
+
+@pytest.mark.parametrize("answer", [[1.0, 2.0], np.nan, None])
+def test_messages_that_are_none_name_agent_and_time(answer: Any) -> None:
+    class Chatty:
+        def message(self, t: float, y: np.ndarray) -> Any:
+            return answer if t > 0.15 else y
+
+        def step(self, *_: Any) -> float:
+            return 0.0
+
+    with pytest.raises(InputError, match=r"message of agent 1 at t = 0.2 s: expected 1"):
+        rows_of(PythonLaw(AGENT, NETWORK, [Chatty()] * 3))
+
+
+def test_each_is_asked_when_its_period_begins_and_only_then() -> None:
+    """Also one that all share; the time of messages is that of the communication point."""
+    asked: list[tuple[int, float]] = []
+    told: list[float] = []
+
+    class Counting:
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def message(self, t: float, y: np.ndarray) -> np.ndarray:
+            told.append(t)
+            return y
+
+        def step(self, t: float, *_: Any) -> float:
+            asked.append((self.number, t))
+            return 0.0
+
+        def step_all(self, t: float, *_: Any) -> np.ndarray:
+            asked.append((0, t))
+            return np.zeros(3)
+
+    every = np.array([2, 3, 2])
+    for controllers in ([Counting(k) for k in (1, 2, 3)], Counting(0)):
+        law = PythonLaw(AGENT, NETWORK, controllers, every)
+        definition = attrs.evolve(system(law), clock=Clock.of(0.6, 0.1), every=every)
+        simulate(definition, ModelPlant(AGENT, np.ones((3, 1))))
+    of_each = {k: [t for number, t in asked if number == k] for k in range(4)}
+    assert of_each[1] == of_each[3] == [0.0, 0.2, 0.4, 0.6]
+    assert of_each[2] == [0.0, 0.3, 0.6]
+    assert of_each[0] == [0.0, 0.2, 0.3, 0.4, 0.6]
+    assert told[::3] == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+
+
+def test_an_arc_that_is_off_is_not_heard() -> None:
+    heard: dict[tuple[float, int], tuple[int, bool]] = {}
+
+    class Listening:
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def step(self, t: float, y: np.ndarray, neighbours: np.ndarray, s: Any) -> float:
+            heard[t, self.number] = len(neighbours), s is not None
+            return 0.0
+
+    law = PythonLaw(AGENT, NETWORK, [Listening(k) for k in (1, 2, 3)])
+    numbers = NETWORK.arc_numbers()
+    off = [numbers[1, 3], numbers[0, 1]]
+    definition = attrs.evolve(system(law), episodes=(Episode("arc_off", off, 1.0, 1, 2),))
+    simulate(definition, ModelPlant(AGENT, np.ones((3, 1))))
+    of_all = [[heard[t, k] for k in (1, 2, 3)] for t in (0.0, 0.1, 0.2)]
+    assert of_all[0] == of_all[2] == [(1, True), (1, False), (2, False)]
+    assert of_all[1] == [(1, False), (1, False), (1, False)]
 
 
 def test_controllers_that_are_none() -> None:

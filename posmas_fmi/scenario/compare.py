@@ -6,8 +6,9 @@ import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,12 @@ from posmas_fmi.scenario.job import (
     write_json,
 )
 from posmas_fmi.scenario.plant import fmu_files, make_instances
+from posmas_fmi.scenario.resume import forget_snapshots
 from posmas_fmi.scenario.tables import CompareTable, ControlTable
 
 _LOOK = 0.2  # s between two looks at the runs
 PRACTICE = "pi"
+LEFT = ("summary.json", "manifest.json", "design.json", "report.html", "results.nc", "results.csv")
 ENDED = ("failed", "cancelled", "diverged")  # before the end of the run
 
 
@@ -111,19 +114,13 @@ def run_comparison(
     single = attrs.evolve(scenario, compare=None)
     runs = {name: attrs.evolve(single, control=table) for name, table in tables.items()}
     for name, one in runs.items():
-        place = f"$.controllers.{name}" if name in scenario.controllers else "$.control"
-        try:
+        with _placed(scenario, name):
             make_law(one, designed)
             make_instances(one, fmu_files(one), extras(one))
-        except InputError as error:
-            raise InputError(error.message, error.where.replace("$.control", place, 1)) from None
     with occupied(folder):
-        for name in ("summary.json", "report.html", "results.nc"):
-            (folder / name).unlink(missing_ok=True)
         steps = scenario.clock.steps
-        summaries = _all(
-            runs, designed, folder, command, report, steps, progress("compare"), compare
-        )
+        shown = progress("compare")
+        summaries = _all(scenario, runs, designed, folder, command, report, steps, shown)
         summary = together(summaries, compare)
         summary["wall_s"] = round(time.perf_counter() - began, 3)
         write_json(folder / "summary.json", summary)
@@ -135,7 +132,19 @@ def run_comparison(
         return RunResult(folder, designed, summary, designed.certificate.certified)
 
 
+@contextmanager
+def _placed(scenario: Scenario, name: str) -> Iterator[None]:
+    """Let errors about the law of a run name the table of its controller."""
+    place = f"$.controllers.{name}" if name in scenario.controllers else "$.control"
+    try:
+        yield
+    except InputError as error:
+        where = error.where.replace("$.control", place, 1)
+        raise InputError(error.message, where) from error.__cause__
+
+
 def _all(
+    scenario: Scenario,
     runs: dict[str, Scenario],
     designed: Design,
     folder: Path,
@@ -143,12 +152,12 @@ def _all(
     report: bool,
     steps: int,
     progress: Progress | None,
-    compare: CompareTable,
 ) -> dict[str, dict[str, Any]]:
     """Run all controllers in processes of their own; return their summaries."""
     context = multiprocessing.get_context("spawn")
     done = context.Array("q", len(runs), lock=False)
-    workers = min(len(runs), compare.processes or os.cpu_count() or 1)
+    wanted = scenario.compare.processes if scenario.compare is not None else None
+    workers = min(len(runs), wanted or os.cpu_count() or 1)
     with ProcessPoolExecutor(workers, context, _share, (done,)) as pool:
         futures: dict[str, Future[dict[str, Any]]] = {
             name: pool.submit(_one, k, one, designed, folder / name, command, report)
@@ -158,8 +167,9 @@ def _all(
             pending = set(futures.values())
             while pending:
                 ended, pending = wait(pending, _LOOK)
-                for future in ended:
-                    future.result()  # an error of one run ends the comparison at once
+                for name in [name for name, future in futures.items() if future in ended]:
+                    with _placed(scenario, name):
+                        futures[name].result()  # an error of one run ends the comparison at once
                 if progress is not None and sum(done):
                     progress(sum(done), steps * len(runs))
         except BaseException:
@@ -185,7 +195,16 @@ def _one(
     def count(done: int, total: int) -> None:
         _done[number] = done
 
-    return run_designed(scenario, designed, folder, lambda label: count, command, report).summary
+    def started() -> None:
+        """Give up what an earlier comparison, or a plain run, left above: this run begins."""
+        for name in LEFT:
+            (folder.parent / name).unlink(missing_ok=True)
+        forget_snapshots(folder.parent)
+
+    made = run_designed(
+        scenario, designed, folder, lambda label: count, command, report, started=started
+    )
+    return made.summary
 
 
 def together(summaries: dict[str, dict[str, Any]], compare: CompareTable) -> dict[str, Any]:

@@ -171,8 +171,12 @@ def run_designed(
     report: bool = True,
     resume: bool = False,
     branch: tuple[Path, float] | None = None,
+    started: Callable[[], None] = lambda: None,
 ) -> RunResult:
-    """Run a scenario with a design that is there already; see `run`."""
+    """Run a scenario with a design that is there already; see `run`.
+
+    `started` is called when all FMUs run, before anything of an earlier run is given up.
+    """
     designed = attrs.evolve(designed, network=law_network(scenario, designed))
     files = fmu_files(scenario)
     instances = make_instances(scenario, files, extras(scenario))
@@ -184,7 +188,8 @@ def run_designed(
     told = manifest(scenario, files, choice, command)
     with occupied(folder):
         return _run_in(
-            folder, scenario, designed, instances, choice, told, progress, report, resume, branch
+            *(folder, scenario, designed, instances, choice, told, progress, report),
+            *(resume, branch, started),
         )
 
 
@@ -199,6 +204,7 @@ def _run_in(
     report: bool,
     resume: bool,
     branch: tuple[Path, float] | None,
+    begins: Callable[[], None],
 ) -> RunResult:
     """Simulate, judge and report in a folder that is held for it; `told` is the manifest."""
     from posmas_fmi.report import write_report
@@ -219,6 +225,7 @@ def _run_in(
 
     def started(plant: FmuPlant) -> None:
         """All FMUs run: only now is what an earlier run left in the folder given up."""
+        begins()
         for name in ("summary.json", "report.html", "results.csv"):
             (folder / name).unlink(missing_ok=True)
         if not resume:  # a run cut off from here on does not go on with what another one left
@@ -341,17 +348,19 @@ def _without_control(
 
 def _own_law(scenario: Scenario, designed: Design) -> Law:
     """Return controllers of the user's own."""
-    from posmas_fmi.cosim.python_law import PythonLaw, load_class
+    from posmas_fmi.cosim.python_law import PythonLaw, load_class, make
 
-    made = load_class(str(scenario.control.python), scenario.path.parent)
-    parameters = scenario.control.parameters
-    try:
-        if hasattr(made, "step_all"):
-            return PythonLaw(scenario.agent, designed.network, made(**parameters))
-        each = [made(k + 1, **parameters) for k in range(designed.network.N)]
-    except TypeError as error:
-        raise InputError(f"cannot be made: {error}", "$.control.python") from error
-    return PythonLaw(scenario.agent, designed.network, each)
+    found = load_class(str(scenario.control.python), scenario.path.parent)
+    given, N = scenario.control.parameters, designed.network.N
+    controllers = (
+        make(found, **given)
+        if hasattr(found, "step_all")
+        else [make(found, k + 1, **given) for k in range(N)]
+    )
+    every = [1] * N
+    for override in scenario.plant.override:
+        every[override.agent - 1] = override.every
+    return PythonLaw(scenario.agent, designed.network, controllers, every, scenario.clock)
 
 
 def make_law(scenario: Scenario, designed: Design) -> Law:

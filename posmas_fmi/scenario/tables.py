@@ -536,9 +536,9 @@ class ControlTable:
     parameters : table
         Of the law; for cooling those of `posmas_fmi.cooling.Control`.
     python : str, optional
-        ``"file.py:Class"``, a controller of one's own instead of a law, see
-        `posmas_fmi.cosim.python_law`: an object per agent, made with its number and the
-        parameters, or one for all if it has ``step_all``. Running the scenario runs that file.
+        ``"file.py:Class"``, a controller of one's own instead of a law: an object per agent, made
+        with its number and the parameters, or one for all if it has ``step_all``. Running the
+        scenario runs that file.
     """
 
     law: str = "protocol"

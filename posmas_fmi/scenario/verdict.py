@@ -26,8 +26,8 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
     dict
         ``verdict`` is one of ``converged``, ``not settled`` (it would be converged, but the
         iteration of coupled FMUs did not settle in every step), ``not converged``,
-        ``positivity lost``, ``diverged``, ``failed``, ``cancelled``. ``ended`` tells how the run ended; ``terminated``: an FMU asked
-        for it, and the verdict is about the state by then.
+        ``positivity lost``, ``diverged``, ``failed``, ``cancelled``. ``ended`` tells how the run
+        ended; ``terminated``: an FMU asked for it, and the verdict is about the state by then.
     """
     agents = [
         {
