@@ -1,7 +1,10 @@
 import json
+import os
+import socket
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import pytest
 from fmu_examples import tank_fmu
@@ -330,6 +333,36 @@ def test_check_of_what_is_not_there_is_bad_input(tmp_path, capsys, arguments):
     assert main(["check", *(str(path) if a == "TANK" else a for a in arguments)]) == 2
     said = capsys.readouterr().err
     assert "no such file" in said or "did you mean 'power'" in said
+
+
+def test_check_of_what_cannot_be_read_is_bad_input(tmp_path, capsys, monkeypatch):
+    """A file without permission was a damaged archive; a pipe must not be waited for."""
+    good = tank_fmu(tmp_path, 2)
+    empty, pipe, socket_ = (tmp_path / f"{n}.fmu" for n in ("empty", "pipe", "socket"))
+    empty.touch()
+    os.mkfifo(pipe)
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(socket_))
+    for path, told in (
+        (empty, "the file is empty"),
+        (pipe, "no regular file"),
+        (socket_, "no regular file"),
+        (Path("/dev/zero"), "no regular file"),
+        (tmp_path, "this is a folder"),
+        (tmp_path / ("x" * 300), "File name too long"),
+    ):
+        assert main(["check", str(path)]) == 2
+        assert told in capsys.readouterr().err
+    # root may read everything, so that a mode would show nothing where tests run as root
+
+    def refused(self, *given, **named):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "open", refused)
+    assert main(["check", str(good)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(good) in line
+    assert "permission denied" in line
 
 
 def test_the_text_of_a_design_tells_baseline_band_and_region(tmp_path, capsys):

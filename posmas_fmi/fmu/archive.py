@@ -58,19 +58,25 @@ def unpack(fmu: Path, folder: Path) -> None:
 
 
 def require_file(path: Path) -> None:
-    """Raise InputError if there is no file."""
-    if not path.is_file():
-        raise InputError(f"expected an FMU ({_instead(path)})", str(path))
+    """Raise InputError if there is no file, or none with anything in it that may be read."""
+    instead = _instead(path)
+    if instead:
+        raise InputError(f"expected an FMU ({instead})", str(path))
 
 
 def _instead(path: Path) -> str:
-    """Say what there is, where there is no file."""
+    """Say what there is, where there is no file that can be read; empty if there is one."""
     try:
         if path.is_dir():
             return "this is a folder; zip what is in it"
-        return "this is no regular file" if path.exists() else "there is no such file"
+        if not path.is_file():  # opening a pipe would wait for ever
+            return "this is no regular file" if path.exists() else "there is no such file"
+        with path.open("rb") as file:
+            return "" if file.read(1) else "the file is empty; copy or export it again"
+    except PermissionError:
+        return "it may not be read: permission denied; 'chmod +r' lets it"
     except OSError as error:
-        return str(error.strerror)
+        return f"it cannot be read: {error.strerror}"
 
 
 def examine(fmu: Path, whole: bool = False) -> list[Finding]:
@@ -87,8 +93,9 @@ def examine(fmu: Path, whole: bool = False) -> list[Finding]:
     list of Finding
         A fatal one stands for an archive that `unpack` refuses.
     """
-    if not fmu.is_file():
-        return [_fatal("archive-missing", "", f"expected an FMU ({_instead(fmu)})")]
+    instead = _instead(fmu)
+    if instead:
+        return [_fatal("archive-missing", "", f"expected an FMU ({instead})")]
     try:
         with zipfile.ZipFile(fmu) as archive:
             findings = list(_entries(archive.infolist(), fmu.stat().st_size))

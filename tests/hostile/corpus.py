@@ -260,7 +260,8 @@ _BOMB = bytes(300 * 2**20)
 _ENTITY = '<!DOCTYPE a [<!ENTITY b "x">]><a>&b;</a>'
 
 ARCHIVE = [
-    Defect("empty file", "the file is empty", "fatal", "archive-damaged", damage=lambda d: b""),
+    Defect("one byte", "the file holds one byte", "fatal", "archive-damaged",
+           damage=lambda d: d[:1]),
     Defect("text file", "it is no archive", "fatal", "archive-damaged", damage=lambda d: b"PK?"),
     Defect("truncated", "half of the file is missing", "fatal", "archive-damaged",
            damage=lambda d: d[: len(d) // 2]),
