@@ -11,15 +11,18 @@ import hostile
 import numpy as np
 import pytest
 from fmu_examples import tank_fmu
+from test_fmu_events import only_me
 
 from posmas_fmi import load
 from posmas_fmi.cli import main
 from posmas_fmi.expression import VectorFunction
+from posmas_fmi.fmu import build
 from posmas_fmi.fmu.build import agent_fmu
 from posmas_fmi.fmu.check.control import control_report, lines
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.text import to_text
 from posmas_fmi.fmu.evaluation import open_fmu
+from posmas_fmi.fmu.model import Experiment, FmuModel, Variable
 
 
 def report_of(path: Path, inputs: list[str], outputs: list[str], **values: Any) -> dict[str, Any]:
@@ -148,3 +151,37 @@ def test_json_is_json_whatever_an_fmu_returns(
     (made,) = json.loads(capsys.readouterr().out)["fmus"]
     assert made["exit_code"] == code
     assert made["findings"]
+
+
+STATIC = """
+#include "model.h"
+
+void model_derivatives(double t, const double *p, const double *u, const double *x, double *dx)
+{
+    (void)t, (void)p, (void)u, (void)x, (void)dx;
+}
+
+void model_outputs(double t, const double *p, const double *u, const double *x, double *y)
+{
+    (void)t, (void)p, (void)x;
+    y[0] = 2.0 * u[0];
+}
+
+void model_directional(double t, const double *p, const double *u, const double *x,
+                       const double *su, const double *sx, double *sdx, double *sy)
+{
+    (void)t, (void)p, (void)u, (void)x, (void)sx, (void)sdx;
+    sy[0] = 2.0 * su[0];
+}
+"""
+
+
+def test_an_fmu_without_states(tmp_path: Path) -> None:
+    variables = (
+        Variable("u", "input", (1,), (0.0,)),
+        Variable("y", "output", (1,), depends=("u",)),
+    )
+    static = FmuModel("static", "a gain", (u, y), {"model.c": STATIC}, Experiment())
+    made = check_fmu(only_me(build.fmu(static, 2, cache=tmp_path), tmp_path / "me.fmu"))
+    assert made.results["control"]["signs"]["D"] == ["+"]
+    assert "there are no states" in to_text(made)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import test_engine
 import xarray
 from fmu_examples import example_1, named, tank_fmu, vector
 from fmu_scenarios import one_fmu
@@ -207,6 +209,24 @@ def test_a_model_takes_steps_like_its_co_simulation_fmu(tmp_path: Path, fmi: int
             assert instance.time == pytest.approx(0.5)
             found.append(rows)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-8)
+
+
+def test_check_sets_discrete_inputs_of_a_model_in_event_mode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Feedthrough of the Reference FMUs refuses them in Continuous-Time Mode, as it may."""
+    old = "return c ? (fmi2Status)instance_set(INSTANCE(c), vr, nvr, value, nvr) : fmi2Error;"
+    new = f"if (INSTANCE(c)->state.mode == MODE_CONTINUOUS)\n        return fmi2Error;\n    {old}"
+    test_engine.changed(monkeypatch, 2, old, new)
+    path = only_me(tank_fmu(tmp_path, 2), tmp_path / "me.fmu")
+    text = read_entry(path, "modelDescription.xml")
+    power = re.search(rb'name="power"[^>]*>', text)
+    assert power is not None
+    new = power.group().replace(b"continuous", b"discrete")
+    path = described(path, tmp_path / "strict.fmu", power.group(), new)
+    made = check_fmu(path)
+    assert made.results["steps"] > 10
+    assert not [f for f in made.findings if f.code == "status-error"]
 
 
 @pytest.mark.parametrize("engine", ["c", "numpy"])

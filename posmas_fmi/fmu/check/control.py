@@ -265,11 +265,16 @@ def _response(
 
 
 def _signals(file: FmuFile, inputs: Sequence[str], outputs: Sequence[str]) -> Signals:
+    jumps = file.kind == "Model Exchange"  # there discrete ones change at events only
+
     def declared(causality: str) -> list[str]:
         names = [
             v.name
             for v in file.variables.values()
-            if v.causality == causality and v.type in ("Real", "Float64") and v.size
+            if v.causality == causality
+            and v.type in ("Real", "Float64")
+            and v.size
+            and not (jumps and v.variability == "discrete")
         ]
         return list(file.ports(names).names[:_MOST_PORTS]) if names else []
 
@@ -323,6 +328,8 @@ def lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _positive(made: dict[str, Any], pattern: dict[str, list[str]]) -> str:
     if made["metzler"] is None:
         return "unknown: the states are not known"
+    if not pattern["A"]:
+        return "there are no states"
     reasons = [
         f"A[{i},{j}] = {value:.3g} < 0: not Metzler"
         for i, j, value in made["metzler"]["negative"][:3]

@@ -23,6 +23,7 @@ from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.fmi1 import Fmi1File, Fmi1SteppedFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model_exchange import ModelExchangeFile, ModelExchangeInstance
+from posmas_fmi.fmu.stepped import SteppedFile
 from posmas_fmi.fmu.variables import Ports
 
 _ABSURD = 1e30
@@ -84,7 +85,7 @@ class Trial:
         """The FMU; loaded when it is first asked for."""
         path, unpacked = Path(self.job.fmu), Path(self.job.unpacked)
         co_simulation = self.job.interface == "Co-Simulation"
-        kind: type[FmuFile] = FmuFile if co_simulation else ModelExchangeFile
+        kind: type[FmuFile] = FmuFile if co_simulation else SteppedFile
         if self.job.major == 1:
             kind = Fmi1File if co_simulation else Fmi1SteppedFile
         elif self.job.major == 3 and needs_event_mode(
@@ -153,8 +154,6 @@ class Trial:
     def start(self, instance: FmuInstance) -> None:
         """Initialise an instance."""
         instance.initialise(self.job.values, start=self.t0)
-        if isinstance(instance, ModelExchangeInstance):
-            instance.start()
 
     @cached_property
     def t0(self) -> float:
@@ -168,11 +167,7 @@ class Trial:
 
     def step(self, instance: FmuInstance, k: int) -> None:
         """Make the k-th step (from 0)."""
-        t = self.t0 + k * self.h
-        if isinstance(instance, ModelExchangeInstance):
-            instance.advance(t + self.h)
-        else:
-            instance.do_step(t, self.h)
+        instance.do_step(self.t0 + k * self.h, self.h)
 
     @cached_property
     def inputs(self) -> Ports:
