@@ -177,10 +177,7 @@ void model_directional(double t, const double *p, const double *u, const double 
 
 
 def test_an_fmu_without_states(tmp_path: Path) -> None:
-    variables = (
-        Variable("u", "input", (1,), (0.0,)),
-        Variable("y", "output", (1,), depends=("u",)),
-    )
+    u, y = Variable("u", "input", (1,), (0.0,)), Variable("y", "output", (1,), depends=("u",))
     static = FmuModel("static", "a gain", (u, y), {"model.c": STATIC}, Experiment())
     made = check_fmu(only_me(build.fmu(static, 2, cache=tmp_path), tmp_path / "me.fmu"))
     assert made.results["control"]["signs"]["D"] == ["+"]
