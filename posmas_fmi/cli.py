@@ -7,10 +7,10 @@ import json
 import logging
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from posmas_fmi.errors import InputError, PosmasError
@@ -62,16 +62,26 @@ def keep_interrupts() -> None:
     """See that no Ctrl-C is lost, for a process that does one command.
 
     Python swallows an exception that comes up while it frees an object, with a traceback on
-    stderr. If that exception is Ctrl-C, it is raised again a moment later.
+    stderr. If that exception is Ctrl-C, it is raised again where the program goes on: at its next
+    line or call, whatever else it frees before.
     """
 
     def swallowed(it: Any) -> None:
         if not issubclass(it.exc_type, KeyboardInterrupt):
             sys.__unraisablehook__(it)
             return
-        again = threading.Timer(0.01, signal.raise_signal, [signal.SIGINT])
-        again.daemon = True
-        again.start()
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None:  # those that are there already
+            frame.f_trace = again
+            frame = frame.f_back
+        sys.settrace(again)  # and those to come
+        sys.setprofile(again)  # calls of functions in C as well: they may wait
+
+    def again(frame: FrameType, event: str, argument: Any) -> None:
+        if frame.f_code is not swallowed.__code__:  # what is raised there is swallowed as well
+            sys.settrace(None)
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
 
     sys.unraisablehook = swallowed
 

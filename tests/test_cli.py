@@ -376,19 +376,33 @@ def test_the_text_of_a_design_tells_baseline_band_and_region(tmp_path, capsys):
         assert words in printed
 
 
-def test_ctrl_c_while_an_object_is_freed_is_not_lost():
+@pytest.mark.parametrize(
+    "frees",
+    [
+        "Freed(); time.sleep(600)",
+        "Freed()\n    while True: pass",
+        "Freed(); Freed(); Freed(); time.sleep(600)",  # it is swallowed again, and again
+        "pause()",
+    ],
+)
+def test_ctrl_c_while_an_object_is_freed_is_not_lost(frees):
     code = (
         "import time\n"
         "from posmas_fmi.cli import keep_interrupts\n"
         "class Freed:\n"
         "    def __del__(self):\n"
         "        raise KeyboardInterrupt\n"
+        "def pause(depth=3):\n"
+        "    Freed()\n"
+        "    pause(depth - 1) if depth else time.sleep(600)\n"
         "keep_interrupts()\n"
         "try:\n"
-        "    Freed()\n"
-        "    time.sleep(20)\n"
+        f"    {frees}\n"
         "except KeyboardInterrupt:\n"
         "    print('came')\n"
+        "time.sleep(0)\n"  # and once only
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
+    )
     assert (done.stdout.strip(), done.stderr) == ("came", "")
