@@ -236,5 +236,5 @@ def test_netcdf_that_says_to_hold_terabytes(folder: Path) -> None:
 
 def test_what_is_no_netcdf(folder: Path) -> None:
     (folder / "loads.nc").write_bytes(b"nonsense")
-    with pytest.raises((InputError, ScenarioError), match="cannot be read as NetCDF-4"):
+    with pytest.raises((InputError, ScenarioError), match="expected a NetCDF-4 file"):
         load(write(folder, *NC))

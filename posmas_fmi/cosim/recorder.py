@@ -18,6 +18,7 @@ import numpy as np
 
 from posmas_fmi.errors import InputError, ResultsError
 from posmas_fmi.expression import Array
+from posmas_fmi.netcdf import read_netcdf
 from posmas_fmi.network import Network
 from posmas_fmi.writing import whole
 
@@ -123,7 +124,7 @@ class Recorder:
         self._rows = 0  # of the file
         self._expected = expected
         if keep is not None:
-            _check(path, tuple(self._blocks), keep)
+            self._offsets = _check(path, {name: self._shape(name) for name in self._blocks}, keep)
             for name in self._blocks:
                 if name != "x_baseline":  # that run is made anew
                     self._taken[name] = self._written[name] = self._given[name] = keep
@@ -133,8 +134,7 @@ class Recorder:
     @property
     def _row_size(self) -> int:
         """Bytes of one row of all variables."""
-        sizes = (self._layout.shape(name)[1] for name in self._variables)
-        return 8 + sum(8 * int(np.prod(size)) for size in sizes)
+        return sum(8 * int(np.prod(self._shape(name))) for name in self._blocks)
 
     # ---- the file -------------------------------------------------------------------------------
 
@@ -208,15 +208,20 @@ class Recorder:
 
     def _copy(self, handle: int, offsets: dict[str, int]) -> None:
         """Take the rows over from the file there is."""
-        import h5py
-
-        with h5py.File(self._path, "r") as old:
+        old = os.open(self._path, os.O_RDONLY | _OPEN)
+        try:
             for name, count in self._written.items():
-                size = 8 * int(np.prod(old[name].shape[1:]))
-                step = max(1, HELD // size)
-                for begin in range(0, count, step):
-                    rows = old[name][begin : min(begin + step, count)]
-                    _write(handle, rows, offsets[name] + begin * size)
+                size = 8 * count * int(np.prod(self._shape(name)))
+                os.lseek(old, self._offsets[name], os.SEEK_SET)
+                for begin in range(0, size, HELD):
+                    rows = os.read(old, min(HELD, size - begin))
+                    _write(handle, np.frombuffer(rows, dtype=np.uint8), offsets[name] + begin)
+        finally:
+            os.close(old)
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Return the shape of a row."""
+        return () if name == "time" else self._layout.shape(name)[1]
 
     def _define(self, file: Any, rows: int, complete: bool) -> None:
         layout, network = self._layout, self._network
@@ -383,23 +388,29 @@ def written_rows(time: Array) -> int:
     return int(missing[0]) if missing.size else len(time)
 
 
-def _check(path: Path, names: tuple[str, ...], keep: int) -> None:
-    """See that one can go on after so many rows of a file."""
-    import h5py
-
+def _check(path: Path, shapes: dict[str, tuple[int, ...]], keep: int) -> dict[str, int]:
+    """See that one can go on after so many rows of a file; return where its variables begin."""
+    what = "cannot go on with these results"
     try:
-        with h5py.File(path, "r") as file:
-            missing = [name for name in names if name not in file]
-            rows = 0 if "time" in missing else written_rows(file["time"][...])
-    except OSError as error:
-        raise InputError(f"cannot go on with these results: {error}", str(path)) from None
+        file = read_netcdf(path, ("time",))
+    except InputError as error:
+        raise InputError(f"{what}: {error.message}", str(path)) from None
+    found = file.variables
+    missing = [n for n, shape in shapes.items() if n not in found or found[n].shape[1:] != shape]
+    time = found["time"].numbers if "time" in found else None
+    rows = 0 if time is None else written_rows(time)
     if missing or rows < keep:
-        found = f"no {missing[0]}" if missing else f"{rows} rows"
+        there = f"no {missing[0]}" if missing else f"{rows} rows"
         raise InputError(
-            f"cannot go on with these results: expected {keep} rows of {', '.join(names)} "
-            f"(there is {found})",
-            str(path),
+            f"{what}: expected {keep} rows of {', '.join(shapes)} (there is {there})", str(path)
         )
+    size, offsets = path.stat().st_size, {}
+    for name, shape in shapes.items():
+        offset = found[name].offset
+        if keep and (offset is None or offset + 8 * keep * int(np.prod(shape)) > size):
+            raise InputError(f"{what}: {name} is not as this version writes it", str(path))
+        offsets[name] = offset or 0
+    return offsets
 
 
 def _write(handle: int, rows: Array, at: int) -> None:
@@ -410,7 +421,8 @@ def _write(handle: int, rows: Array, at: int) -> None:
         left = left[os.write(handle, left) :]
 
 
-_FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+_OPEN = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+_FLAGS = os.O_RDWR | _OPEN
 
 
 class Thinned:

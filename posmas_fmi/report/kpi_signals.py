@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.report.foreign import AGAIN, number
+from posmas_fmi.netcdf import NetcdfFile
+from posmas_fmi.report.foreign import number
 from posmas_fmi.report.kpi_data import Signals
 from posmas_fmi.report.results_file import (
-    LARGEST_VARIABLE,
-    Rows,
     open_results,
     read_labels,
     read_network,
     read_variable,
-    recorded,
+)
+
+_WANTED = (
+    *("time", "agent", "arc_from", "arc_to", "arc_weight", "pinning"),
+    *("supply_temperature", "set_point", "facility_temperature"),
+    *("valve_position", "case_temperature", "heat_load"),
 )
 
 
@@ -39,28 +41,18 @@ def read_signals(path: Path, summary: Mapping[str, Any]) -> Signals | None:
     InputError
         If the file is damaged.
     """
-    with open_results(path) as dataset:
-        try:
-            return _signals(dataset, path, summary)
-        except InputError:
-            raise
-        except Exception as error:  # a truncated file may open and then fail while being read
-            raise InputError(f"the file is damaged ({error}); {AGAIN}", str(path)) from error
+    return _signals(open_results(path, _WANTED), path, summary)
 
 
-def _signals(dataset: Any, path: Path, summary: Mapping[str, Any]) -> Signals | None:
-    if "supply_temperature" not in dataset.variables:
+def _signals(file: NetcdfFile, path: Path, summary: Mapping[str, Any]) -> Signals | None:
+    if "supply_temperature" not in file.variables:
         return None
-    time = np.asarray(read_variable(dataset, "time", ("time",), path), dtype=float)
-    size = dataset["supply_temperature"].size
-    rows = Rows(recorded(time), max(1, math.ceil(size / LARGEST_VARIABLE)))
 
     def read(name: str) -> Array | None:
-        if name not in dataset.variables:
+        if name not in file.variables:
             return None
-        per_line = "agent" in dataset[name].dims
-        dims = ("time", "agent") if per_line else ("time",)
-        values = rows.of(read_variable(dataset, name, dims, path))
+        per_line = "agent" in file.variables[name].dims
+        values = read_variable(file, name, ("time", "agent") if per_line else ("time",), path)
         return values if per_line else values[:, None]
 
     supply = read("supply_temperature")
@@ -82,11 +74,11 @@ def _signals(dataset: Any, path: Path, summary: Mapping[str, Any]) -> Signals | 
     set_point = column("set_point", "set_point_K")
     if set_point is None:
         return None
-    n = int(dataset.sizes["agent"])
+    n = file.sizes["agent"]
     return Signals(
-        time=rows.of(time)[:stop],
-        names=read_labels(dataset, "agent", n),
-        network=read_network(dataset, n, path),
+        time=read_variable(file, "time", ("time",), path)[:stop],
+        names=read_labels(file, "agent", n),
+        network=read_network(file, n, path),
         deviation=supply[:stop] - set_point,
         supply=supply[:stop],
         set_point=set_point,
@@ -94,5 +86,5 @@ def _signals(dataset: Any, path: Path, summary: Mapping[str, Any]) -> Signals | 
         valve=rest("valve_position"),
         case=rest("case_temperature"),
         heat=rest("heat_load"),
-        stride=rows.stride,
+        stride=file.rows.stride,
     )

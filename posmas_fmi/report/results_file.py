@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import attrs
 import numpy as np
 import scipy.sparse as sp
 
 from posmas_fmi.errors import InputError, NetworkError
 from posmas_fmi.expression import Array
+from posmas_fmi.netcdf import NetcdfFile, read_netcdf
 from posmas_fmi.network import Network
-from posmas_fmi.report.foreign import AGAIN, clean, number, one_line
+from posmas_fmi.report.foreign import AGAIN, clean, number
 
 # Entries read of one variable. Longer runs are read with a stride: a plot cannot show more, and
 # the figures of merit are in summary.json, computed by the master from every sample.
@@ -37,57 +37,29 @@ def read_results(path: Path) -> dict[str, Any]:
     InputError
         If the file is missing, damaged, or not the results of a run.
     """
-    with open_results(path) as dataset:
-        try:
-            return _signals(dataset, path)
-        except InputError:
-            raise
-        except Exception as error:  # a truncated file may open and then fail while being read
-            raise InputError(
-                f"the file is damaged (reading it failed: {one_line(error)}); {AGAIN}", str(path)
-            ) from error
+    return _signals(open_results(path), path)
 
 
-def open_results(path: Path) -> Any:
-    """Open the file as an xarray.Dataset, a context manager; nothing is decoded.
+def open_results(path: Path, names: Sequence[str] | None = None) -> NetcdfFile:
+    """Read the file, thinned out where it is long.
+
+    Parameters
+    ----------
+    path : Path
+    names : sequence of str, optional
+        What is wanted; all by default.
 
     Raises
     ------
     InputError
-        If it is missing or not NetCDF-4.
+        If it is missing, damaged or not NetCDF-4.
     """
-    import h5py
-    import xarray
-
     if not path.is_file():
         raise InputError(f"the file is missing; {AGAIN}", str(path))
     try:
-        with h5py.File(path, "r") as file:  # the layers above leave a half-open file behind
-            dict(file.attrs)
-        return xarray.open_dataset(path, engine="h5netcdf", decode_times=False, decode_coords=False)
-    except Exception as error:  # whatever the HDF5 stack raises on a broken file
-        raise InputError(
-            f"expected a NetCDF-4 file (reading it failed: {one_line(error)}); {AGAIN}", str(path)
-        ) from error
-
-
-@attrs.frozen
-class Rows:
-    """Which samples are read: every ``stride``-th of the first ``count``, and the last one.
-
-    The last sample is what the verdict is about, so it is there whatever the stride.
-    """
-
-    count: int
-    stride: int
-
-    def of(self, variable: Any) -> Array:
-        """Read these samples of a variable whose first dimension is time."""
-        values = np.asarray(variable[: self.count : self.stride], dtype=float)
-        if self.count and (self.count - 1) % self.stride:
-            last = np.asarray(variable[self.count - 1 : self.count], dtype=float)
-            values = np.concatenate([values, last])
-        return values
+        return read_netcdf(path, names, LARGEST_VARIABLE)
+    except InputError as error:
+        raise InputError(f"{clean(error.message)}; {AGAIN}", str(path)) from None
 
 
 _SIGNALS = {
@@ -103,78 +75,75 @@ _OPTIONAL = {
 }
 
 
-def _signals(dataset: Any, path: Path) -> dict[str, Any]:
+def _signals(file: NetcdfFile, path: Path) -> dict[str, Any]:
     for name in ("time", *_SIGNALS, "pinning", "arc_from", "arc_to"):
-        if name not in dataset.variables:
-            found = clean(", ".join(sorted(map(str, dataset.variables))))
+        if name not in file.variables:
+            found = clean(", ".join(sorted(file.variables)))
             raise InputError(f"expected a variable '{name}' (found {found}); {AGAIN}", str(path))
-    time = np.asarray(read_variable(dataset, "time", ("time",), path), dtype=float)
-    present = {n: d for n, d in {**_SIGNALS, **_OPTIONAL}.items() if n in dataset.variables}
-    besides = _besides(dataset)
-    largest = max(dataset[name].size for name in (*present, *besides))
-    rows = Rows(recorded(time), max(1, math.ceil(largest / LARGEST_VARIABLE)))
-    signals = {n: rows.of(read_variable(dataset, n, d, path)) for n, d in present.items()}
+    time = read_variable(file, "time", ("time",), path)
+    present = {n: d for n, d in {**_SIGNALS, **_OPTIONAL}.items() if n in file.variables}
+    signals = {n: read_variable(file, n, d, path) for n, d in present.items()}
     filled = np.flatnonzero(~np.all([_blank(signals[n]) for n in ("xhat", "u", "s")], axis=0))
     stop = int(filled[-1]) + 1 if filled.size else 0
     optional = dict.fromkeys(_OPTIONAL) | {
         n: v[:stop] for n, v in signals.items() if n in _OPTIONAL and not np.isnan(v).all()
     }
-    others = {
-        clean(n): rows.of(read_variable(dataset, n, d, path))[:stop] for n, d in besides.items()
-    }
-    sizes = {dim: int(dataset.sizes[dim]) for dim in ("agent", "state", "input", "output")}
-    labels = {dim: read_labels(dataset, dim, size) for dim, size in sizes.items()}
+    others = {clean(n): read_variable(file, n, d, path)[:stop] for n, d in _besides(file).items()}
+    sizes = {dim: file.sizes[dim] for dim in ("agent", "state", "input", "output")}
+    labels = {dim: read_labels(file, dim, size) for dim, size in sizes.items()}
     return {
-        **_attributes(dataset),
-        "stride": rows.stride,
+        **_attributes(file),
+        "stride": file.rows.stride,
         "names": labels.pop("agent"),
         "labels": labels,
-        "network": read_network(dataset, sizes["agent"], path),
-        "time": rows.of(time)[:stop],
+        "network": read_network(file, sizes["agent"], path),
+        "time": time[:stop],
         **{n: signals[n][:stop] for n in _SIGNALS},
         **optional,
         "recorded": {n: values for n, values in others.items() if not np.isnan(values).all()},
     }
 
 
-def _besides(dataset: Any) -> dict[str, tuple[str, ...]]:
+def _besides(file: NetcdfFile) -> dict[str, tuple[str, ...]]:
     """Return what was recorded besides the signals of the protocol, with its dimensions."""
     found: dict[str, tuple[str, ...]] = {}
-    for name, variable in dataset.data_vars.items():
-        dims = tuple(map(str, variable.dims))
-        if name not in {**_SIGNALS, **_OPTIONAL} and variable.dtype.kind in "fiub":
-            if set(dims) == {"time", "agent"}:
-                found[str(name)] = ("time", "agent")
-            elif dims == ("time",):
-                found[str(name)] = dims
+    for name, variable in file.variables.items():
+        known = name in {"time": (), **_SIGNALS, **_OPTIONAL}
+        if known or variable.numbers is None:
+            continue
+        if set(variable.dims) == {"time", "agent"} and len(variable.dims) == 2:
+            found[name] = ("time", "agent")
+        elif variable.dims == ("time",):
+            found[name] = variable.dims
     return found
 
 
-def _attributes(dataset: Any) -> dict[str, Any]:
+def _attributes(file: NetcdfFile) -> dict[str, Any]:
     units = {
-        str(name): clean(str(dataset[name].attrs["units"]))
-        for name in dataset.variables
-        if "units" in dataset[name].attrs
+        name: clean(str(variable.attrs["units"]))
+        for name, variable in file.variables.items()
+        if "units" in variable.attrs
     }
     return {
-        "scenario": clean(str(dataset.attrs.get("scenario", "run"))),
-        "created_by": clean(str(dataset.attrs.get("created_by", ""))),
-        "complete": bool(np.all(dataset.attrs.get("complete", 1))),
-        "period": number(dataset.attrs.get("period")),
+        "scenario": clean(str(file.attrs.get("scenario", "run"))),
+        "created_by": clean(str(file.attrs.get("created_by", ""))),
+        "complete": bool(np.all(file.attrs.get("complete", 1))),
+        "period": number(file.attrs.get("period")),
         "units": units,
     }
 
 
-def read_variable(dataset: Any, name: str, dims: tuple[str, ...], path: Path) -> Any:
-    """Return a variable, not yet read, with its dimensions in this order."""
-    variable = dataset[name]
-    if set(variable.dims) != set(dims) or variable.dtype.kind not in "fiub":
+def read_variable(file: NetcdfFile, name: str, dims: tuple[str, ...], path: Path) -> Array:
+    """Return a variable with its dimensions in this order."""
+    variable = file.variables[name]
+    values = variable.numbers
+    if sorted(variable.dims) != sorted(dims) or values is None:
         raise InputError(
             f"expected numbers over ({', '.join(dims)}) in '{name}' "
-            f"(got {variable.dtype} over ({clean(', '.join(map(str, variable.dims)))})); {AGAIN}",
+            f"(got {variable.dtype} over ({clean(', '.join(variable.dims))})); {AGAIN}",
             str(path),
         )
-    return variable.transpose(*dims)
+    return values.transpose([variable.dims.index(dim) for dim in dims])
 
 
 def _blank(values: Array) -> Array:
@@ -182,32 +151,22 @@ def _blank(values: Array) -> Array:
     return np.asarray(np.isnan(values).all(axis=tuple(range(1, values.ndim))))
 
 
-def recorded(time: Array) -> int:
-    """Return the number of leading rows whose times are finite and increase."""
-    if not time.size or not np.isfinite(time[0]):
-        return 0
-    ends = np.flatnonzero(~(np.diff(time) > 0))
-    return int(ends[0]) + 1 if ends.size else len(time)
-
-
-def read_labels(dataset: Any, dim: str, count: int) -> tuple[str, ...]:
+def read_labels(file: NetcdfFile, dim: str, count: int) -> tuple[str, ...]:
     """Return the names along a dimension, numbers from 1 where it has none."""
-    if dim not in dataset.variables:
+    labels = file.variables[dim].values if dim in file.variables else None
+    if labels is None or len(labels) != count:
         return tuple(str(k + 1) for k in range(count))
-    return tuple(
-        clean(label.decode("utf-8", "replace") if isinstance(label, bytes) else str(label))
-        for label in dataset[dim].values.tolist()
-    )
+    return tuple(clean(x if isinstance(x, str) else f"{x:g}") for x in labels)
 
 
-def read_network(dataset: Any, n: int, path: Path) -> Network:
+def read_network(file: NetcdfFile, n: int, path: Path) -> Network:
     """Return the digraph with its pinning, as stored beside the signals."""
 
     def read(name: str, dim: str) -> Array:
-        return np.asarray(read_variable(dataset, name, (dim,), path), dtype=float)
+        return read_variable(file, name, (dim,), path)
 
     source, target = read("arc_from", "arc"), read("arc_to", "arc")
-    weighted = "arc_weight" in dataset.variables
+    weighted = "arc_weight" in file.variables
     weight = read("arc_weight", "arc") if weighted else np.ones(len(source))
     ends = np.concatenate([source, target])
     if not ((ends >= 0) & (ends < n) & (ends == np.floor(ends))).all():

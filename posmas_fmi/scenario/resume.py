@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import numpy as np
 
 from posmas_fmi.cosim.recorder import written_rows
 from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, newest
 from posmas_fmi.errors import InputError
+from posmas_fmi.netcdf import read_netcdf
 from posmas_fmi.scenario.build import Scenario
 
 FOLDER = "snapshots"
@@ -148,11 +150,14 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _rows(path: Path) -> tuple[int, bool]:
-    """Rows of a result, and whether it is complete."""
-    import h5py
-
-    try:
-        with h5py.File(path, "r") as file:
-            return written_rows(file["time"][...]), bool(file.attrs["complete"])
-    except (OSError, KeyError):
+    """Rows of a result, and whether it is complete; none where there is no file yet."""
+    if not path.exists():
         return 0, False
+    try:
+        file = read_netcdf(path, ("time",))
+    except InputError as error:
+        raise InputError(
+            f"cannot go on with these results: {error.message}; start the run anew", str(path)
+        ) from None
+    time = file.variables["time"].numbers if "time" in file.variables else None
+    return (0 if time is None else written_rows(time)), bool(np.all(file.attrs.get("complete", 0)))

@@ -1,9 +1,8 @@
-"""Signals from outside: read from CSV files, checked, and sampled at communication points."""
+"""Signals from outside: read from files, checked, and sampled at communication points."""
 
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 from typing import Any
 
@@ -231,48 +230,36 @@ def _read_netcdf(path: Path, place: str, table: SignalTable) -> tuple[list[str],
 
     A variable over time and another dimension gives the columns ``name[1]``, ``name[2]``, …
     """
-    import h5netcdf
-    import h5py
+    from posmas_fmi.netcdf import read_netcdf
 
     where = f"{place}.file"
     if not path.is_file():
         raise InputError(f"there is no file {path.name!r} beside the scenario", where)
     try:
-        with h5py.File(path, "r") as raw:  # h5netcdf leaves a broken file half open
-            dict(raw.attrs)
-            raw.visititems(lambda _, entry: dict(entry.attrs) and None)
-        with h5netcdf.File(path, "r") as file:
-            _check_sizes(file, path, where)
-            if "time" not in file.variables or file["time"].dimensions != ("time",):
-                raise InputError(f"{path.name}: expected a variable time over time [s]", where)
-            _check_seconds(file["time"], path, where)
-            header, columns = ["time"], [_numbers(file["time"])[:, None]]
-            for name, variable in file.variables.items():
-                numeric = variable.dtype is not str and np.dtype(variable.dtype).kind in "fiu"
-                if name == "time" or not numeric or variable.dimensions[:1] != ("time",):
-                    continue
-                if len(variable.dimensions) > 2:
-                    continue
-                values = _numbers(variable).reshape(len(columns[0]), -1)
-                one = len(variable.dimensions) == 1
-                header += [name] if one else [f"{name}[{k + 1}]" for k in range(values.shape[1])]
-                columns.append(values)
-                if not table.columns or {name, *header[-values.shape[1] :]} & set(table.columns):
-                    _check_unit(variable.attrs.get("units"), table, f"{path.name}, {name}", place)
-    except InputError:
-        raise
-    except Exception as error:  # whatever HDF5 and what lies above it raise on a broken file
-        raise InputError(f"{path.name} cannot be read as NetCDF-4: {error}", where) from None
+        file = read_netcdf(path, limit=LARGEST_FILE)
+    except InputError as error:
+        remedy = "export it again, or give it as CSV"
+        raise InputError(f"{path.name}: {error.message}; {remedy}", where) from None
+    time = file.variables.get("time")
+    if time is None or time.numbers is None or time.dims != ("time",):
+        raise InputError(f"{path.name}: expected a variable time over time [s]", where)
+    _check_seconds(time.attrs.get("units", "s"), path, where)
+    header, columns = ["time"], [time.numbers[:, None]]
+    for name, variable in file.variables.items():
+        numbers = variable.numbers
+        if name == "time" or numbers is None or variable.dims[:1] != ("time",):
+            continue
+        if len(variable.dims) > 2 or len(numbers) != len(columns[0]):
+            continue
+        values = numbers.reshape(len(numbers), -1)
+        one = len(variable.dims) == 1
+        header += [name] if one else [f"{name}[{k + 1}]" for k in range(values.shape[1])]
+        columns.append(values)
+        if not table.columns or {name, *header[-values.shape[1] :]} & set(table.columns):
+            _check_unit(variable.attrs.get("units"), table, f"{path.name}, {name}", place)
     if len(header) < 2 or not len(columns[0]):
         raise InputError(f"{path.name}: expected a variable over time beside time", where)
     return header, np.concatenate(columns, axis=1)
-
-
-def _check_sizes(file: Any, path: Path, where: str) -> None:
-    """Refuse a file that says to hold too much: some kilobytes may say anything."""
-    for variable in file.variables.values():
-        if math.prod(variable.shape) * 8 > LARGEST_FILE:
-            raise InputError(f"{path.name} holds more than {LARGEST_FILE:g} bytes", where)
 
 
 def _check_unit(unit: Any, table: SignalTable, what: str, place: str) -> None:
@@ -286,22 +273,7 @@ def _check_unit(unit: Any, table: SignalTable, what: str, place: str) -> None:
         )
 
 
-def _numbers(variable: Any) -> Array:
-    """Values as CF means them: packed ones unpacked, missing ones NaN."""
-    values = np.asarray(variable[...], dtype=float)
-    missing = np.zeros(values.shape, dtype=bool)
-    for name in ("_FillValue", "missing_value"):
-        if name in variable.attrs:
-            missing |= np.isin(values, np.asarray(variable.attrs[name], dtype=float))
-    scale, offset = (
-        float(np.ravel(variable.attrs.get(name, default))[0])
-        for name, default in (("scale_factor", 1.0), ("add_offset", 0.0))
-    )
-    return np.where(missing, np.nan, scale * values + offset)
-
-
-def _check_seconds(time: Any, path: Path, where: str) -> None:
-    unit = time.attrs.get("units", "s")
+def _check_seconds(unit: Any, path: Path, where: str) -> None:
     if unit not in ("s", "sec", "second", "seconds"):
         raise InputError(f"{path.name}: expected time in s (got {unit!r})", where)
 

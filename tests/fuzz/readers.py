@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import hostile
 import numpy as np
@@ -65,7 +66,7 @@ def signal(data: bytes) -> None:
 def netcdf(data: bytes) -> None:
     """Read a signal from NetCDF."""
     path = _file("fuzz.nc", data)
-    with suppress(PosmasError):
+    with suppress(PosmasError), patch("posmas_fmi.netcdf.DEADLINE", 2.0):
         read_signal("s", SignalTable(file=path.name), 2, path.parent)
 
 
@@ -168,6 +169,7 @@ def _beginnings(reader: str) -> Iterator[bytes]:
         )
     elif reader == "netcdf":
         yield _netcdf()
+        yield _older_netcdf()
     elif reader == "snapshot":
         path = _file("good.npz", b"")
         Snapshot(3, {"x": np.ones((2, 2))}, {"sent": 1}, (b"state",)).save(path)
@@ -188,6 +190,20 @@ def _netcdf() -> bytes:
         for name, unit in (("time", "s"), ("load", "W")):
             variable = file.create_variable(name, ("time",), float, data=[0.0, 1.0])
             variable.attrs["units"] = unit
+    return path.read_bytes()
+
+
+def _older_netcdf() -> bytes:
+    """As HDF5 wrote before there were checksums, so that damage comes further."""
+    import h5py
+
+    path = _file("older.nc", b"")
+    with h5py.File(path, "w", libver=("earliest", "v108")) as file:
+        time = file.create_dataset("time", data=[0.0, 1.0])
+        time.make_scale("time")
+        load = file.create_dataset("load", data=[0.0, 1.0], chunks=(2,), compression="gzip")
+        load.dims[0].attach_scale(time)
+        time.attrs["units"], load.attrs["units"] = "s", "W"
     return path.read_bytes()
 
 
