@@ -31,7 +31,7 @@ def scenario(folder: Path, more: str) -> str:
     return str(path)
 
 
-def result(folder: Path, more: str = "", until: float = 1.0) -> tuple[dict[str, Any], Any]:
+def result(folder: Path, more: str = "", until: float | None = 1.0) -> tuple[dict[str, Any], Any]:
     made = run(load(scenario(folder, more), until=until), folder / "out", report=False)
     with xarray.open_dataset(folder / "out" / "results.nc") as data:
         return made.summary, data.load()
@@ -166,6 +166,31 @@ WRONG = {
     "slow": ('[[fault]]\nkind = "actuator slow"\nat = 0.1\nvalue = 2.0', "$.fault[0].value"),
     "until": ('[[fault]]\nkind = "leader lost"\nat = 0.1\nuntil = 0.1', "$.fault[0].until"),
     "arc": ('[[fault]]\nkind = "arc off"\nat = 0.1\narcs = [[1, 2]]', "$.fault[0].arcs[0]"),
+    "late": (
+        '[[fault]]\nkind = "leader lost"\nat = 10.0\n[[fault]]\nkind = "leader lost"\nat = 9.99',
+        "$.fault[0].at: begins at 10 s, but the run ends at 10 s: expected a time before",
+    ),
+    "late jump": ("[[leader.jump]]\nat = 11.0\ns = [1.0, 1.0]", "$.leader.jump[0].at"),
+    "same point": (
+        "".join(f"[[leader.jump]]\nat = {at}\ns = [1.0, 1.0]\n" for at in (0.0991, 0.0992)),
+        "$.leader.jump[1].at",
+    ),
+    "agents of arcs": (
+        '[[fault]]\nkind = "messages lost"\nat = 0.1\nagents = [1]',
+        "$.fault[0].agents: 'messages lost' takes arcs and value, not agents",
+    ),
+    "arcs of agents": (
+        '[[fault]]\nkind = "actuator stuck"\nat = 0.1\narcs = [[2, 1]]',
+        "$.fault[0].arcs: 'actuator stuck' takes agents and ports, not arcs",
+    ),
+    "value for nothing": (
+        '[[fault]]\nkind = "arc off"\nat = 0.1\nvalue = 0.0',
+        "$.fault[0].value",
+    ),
+    "a long crash": (
+        '[[fault]]\nkind = "FMU crash"\nat = 0.1\nuntil = 0.2',
+        "$.fault[0].until: a crash happens once",
+    ),
     "kind": ('[[fault]]\nkind = "broken"\nat = 0.1', "$.fault[0].kind"),
     "jump": ("[[leader.jump]]\nat = 0.1\ns = [1.0]", "$.leader.jump[0].s"),
     "order": (
@@ -184,6 +209,32 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_mistakes_name_their_place(name: str, tmp_path: Path) -> None:
     text, place = WRONG[name]
+    until = None if "late" in name else 1.0
     with pytest.raises((InputError, ScenarioError)) as caught:
-        result(tmp_path, text)
+        result(tmp_path, text, until)
     assert place in str(caught.value)
+
+
+def test_a_run_that_ends_early_leaves_out_what_comes_later(
+    tmp_path: Path, plain: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    late = '[[fault]]\nkind = "sensor stuck"\nat = 1.0\n[[leader.jump]]\nat = 2.0\ns = [1.0, 1.0]'
+    summary, data = result(tmp_path, late)
+    assert "$.fault[0].at: begins at 1 s, but the run ends at 1 s: left out" in caplog.text
+    assert "faults" not in summary
+    xarray.testing.assert_equal(data["x"], plain[1]["x"])
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ('"messages lost"\narcs = [[2, 1], [0, 2]]', "arc 2 -> 1, arc leader -> 2"),
+        ('"messages lost"', "all arcs"),
+        ('"arc off"\narcs = [[2, 3]]', "arc 2 -> 3"),
+        ('"leader lost"', "the arcs from the leader"),
+        ('"sensor stuck"', "all"),
+    ],
+)
+def test_the_summary_says_where_a_fault_is(text: str, where: str, tmp_path: Path) -> None:
+    summary, _ = result(tmp_path, f"[[fault]]\nat = 0.1\nkind = {text}\n", until=0.2)
+    assert summary["faults"][0]["agent"] == where

@@ -21,7 +21,7 @@ from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.expression import Array, VectorFunction, parse
 from posmas_fmi.network import Network, network_from_arcs
 from posmas_fmi.network_file import read_adjacency
-from posmas_fmi.scenario.faults import make_episodes
+from posmas_fmi.scenario.faults import check_times, make_episodes
 from posmas_fmi.scenario.paths import Named, data_files, leaving
 from posmas_fmi.scenario.reading import read_tables
 from posmas_fmi.scenario.signals import Columns, Signal, Signals, read_signal
@@ -193,14 +193,17 @@ def load(
     given: dict[str, Any] = {"period": period, "until": until, "seed": seed}
     instead = {k: v for k, v in given.items() if v is not None}
     tables, text = read_tables(path, instead, outside)
-    return _Builder(tables, path, text, outside).build()
+    return _Builder(tables, path, text, outside, until is not None).build()
 
 
 class _Builder:
     """Builds part by part and gathers the problems of all parts."""
 
-    def __init__(self, tables: ScenarioFile, path: Path, text: str, outside: bool) -> None:
+    def __init__(
+        self, tables: ScenarioFile, path: Path, text: str, outside: bool, shortened: bool
+    ) -> None:
         self.tables, self.path, self.text, self.outside = tables, path, text, outside
+        self.shortened = shortened  # the run ends elsewhere than the file says
         self.problems: list[tuple[str, str]] = []
 
     def build(self) -> Scenario:
@@ -225,6 +228,9 @@ class _Builder:
                         f"expected 1 to {network.N} (got {override.agent})",
                     )
                 )
+        faults: list[FaultTable] | None = []
+        if clock:
+            faults = self.attempt(lambda: check_times(tables.fault, clock, self.shortened))
         x0 = xhat0 = s0 = None
         jumps: tuple[tuple[int, Array], ...] | None = ()
         sensors: Sensors | None = None
@@ -238,7 +244,7 @@ class _Builder:
             s0 = self.attempt(lambda: _leader(tables.leader.s0, m, "$.leader.s0"))
             q = agent.q
             sensors = self.attempt(lambda: _sensors(tables.sensors, n, q))
-            jumps = self.attempt(lambda: _jumps(tables.leader.jump, m, clock))
+            jumps = self.attempt(lambda: _jumps(tables.leader.jump, m, clock, self.shortened))
             if agent is not None and not pins_open(tables.network):
                 self.attempt(lambda: make_episodes(tables.fault, network, agent, clock))
             self.attempt(lambda: make_channel(tables.channel, network, clock.h))
@@ -286,7 +292,7 @@ class _Builder:
             cooling=tables.cooling,
             components=tuple(tables.component),
             connections=tuple(tables.connection),
-            faults=tuple(tables.fault),
+            faults=tuple(faults or ()),
             sensors=sensors,
             jumps=jumps or (),
             signals=Signals(tuple(made.values()), clock) if made else None,
@@ -591,13 +597,25 @@ def _sensors(table: SensorTable, n: int, q: int) -> Sensors | None:
     return Sensors(**rows) if any(row.any() for row in rows.values()) else None
 
 
-def _jumps(jumps: list[JumpTable], m: int, clock: Clock) -> tuple[tuple[int, Array], ...]:
+def _jumps(
+    jumps: list[JumpTable], m: int, clock: Clock, shortened: bool
+) -> tuple[tuple[int, Array], ...]:
+    """Communication points and states; those after the end only where that is not the file's."""
     made: list[tuple[int, Array]] = []
     for k, jump in enumerate(jumps):
-        place = f"$.leader.jump[{k}]"
-        if not jump.at > (jumps[k - 1].at if k else 0.0):
-            raise InputError("expected times > 0 s, one after the other", f"{place}.at")
-        made.append((steps_of(jump.at, clock.h), _leader(jump.s, m, f"{place}.s")))
+        place, point = f"$.leader.jump[{k}]", steps_of(jump.at, clock.h)
+        if not jump.at > 0 or (made and point <= made[-1][0]):
+            raise InputError(
+                "expected times > 0 s, one after the other, at communication points of their own",
+                f"{place}.at",
+            )
+        if point > clock.steps and not shortened:
+            end = clock.time(clock.steps)
+            raise InputError(
+                f"expected a time before the end of the run, {end:g} s (got {jump.at:g} s)",
+                f"{place}.at",
+            )
+        made.append((point, _leader(jump.s, m, f"{place}.s")))
     return tuple(made)
 
 

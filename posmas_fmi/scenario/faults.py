@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,11 @@ import numpy as np
 from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.cosim.conditions import NEVER, Episode, steps_of
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.network import Network
 from posmas_fmi.scenario.tables import FaultTable
+
+log = logging.getLogger(__name__)
 
 # What each kind does, and what is proved all the same where P, C or T hold.
 KINDS = {
@@ -33,6 +36,50 @@ KINDS = {
 }
 
 
+# The keys that a kind takes beside ``kind``, ``at`` and, where it lasts, ``until``.
+KEYS = {
+    "sensor stuck": ("agents", "ports"),
+    "sensor bias": ("agents", "ports", "value"),
+    "sensor noise": ("agents", "ports", "value"),
+    "actuator stuck": ("agents", "ports"),
+    "actuator slow": ("agents", "ports", "value"),
+    "messages lost": ("arcs", "value"),
+    "leader lost": ("value",),
+    "FMU crash": ("agents",),
+    "arc off": ("arcs",),
+}
+
+
+def check_times(faults: list[FaultTable], clock: Clock, shortened: bool) -> list[FaultTable]:
+    """Return the faults that come to pass.
+
+    Parameters
+    ----------
+    faults : list of FaultTable
+    clock : Clock
+    shortened : bool
+        Whether the run ends elsewhere than its scenario says: then what begins after it is left
+        out with a warning, else it is a mistake.
+
+    Raises
+    ------
+    ScenarioError
+        Naming every fault that begins too late.
+    """
+    late = [k for k, f in enumerate(faults) if steps_of(f.at, clock.h) >= clock.steps]
+    told = "begins at {:g} s, but the run ends at {:g} s"
+    texts = {k: told.format(faults[k].at, clock.time(clock.steps)) for k in late}
+    if late and not shortened:
+        raise ScenarioError(
+            tuple(
+                (f"$.fault[{k}].at", f"{text}: expected a time before") for k, text in texts.items()
+            )
+        )
+    for k, text in texts.items():
+        log.warning("$.fault[%d].at: %s: left out", k, text)
+    return [fault for k, fault in enumerate(faults) if k not in texts]
+
+
 def make_episodes(
     faults: list[FaultTable], network: Network, agent: Agent, clock: Clock
 ) -> tuple[Episode, ...]:
@@ -49,7 +96,8 @@ def make_episodes(
     Raises
     ------
     InputError
-        If an agent, a port or an arc does not exist, or a value is missing or out of range.
+        If an agent, a port or an arc does not exist, a value is missing or out of range, or a key
+        means nothing for this kind.
     """
     return tuple(
         episode
@@ -74,6 +122,7 @@ def _episodes(
     fault: FaultTable, network: Network, agent: Agent, clock: Clock, place: str
 ) -> list[Episode]:
     begin, end = steps_of(fault.at, clock.h), steps_of(fault.until, clock.h)
+    _check_keys(fault, place)
     if not fault.at >= 0:
         raise InputError(f"expected a time >= 0 s (got {fault.at:g})", f"{place}.at")
     if end <= begin:
@@ -99,6 +148,21 @@ def _episodes(
     ports = _ports(fault, agent.p, "inputs", place)
     gain = 0.0 if fault.kind == "actuator stuck" else _value(fault, place, None, 0.0, 1.0)
     return [Episode("actuator_gain", np.ix_(agents, ports), gain, begin, end)]
+
+
+def _check_keys(fault: FaultTable, place: str) -> None:
+    takes = KEYS[fault.kind]
+    for key in ("agents", "ports", "arcs", "value"):
+        if getattr(fault, key) not in ([], None) and key not in takes:
+            raise InputError(
+                f"{fault.kind!r} takes {' and '.join(takes)}, not {key}; leave it out",
+                f"{place}.{key}",
+            )
+    if fault.kind == "FMU crash" and fault.until is not None:
+        raise InputError(
+            "a crash happens once; what follows is [plant] on_failure: leave it out",
+            f"{place}.until",
+        )
 
 
 def _value(
@@ -147,6 +211,17 @@ def _arcs(fault: FaultTable, network: Network, place: str) -> Any:
     return chosen
 
 
+def _where(fault: FaultTable, network: Network) -> str:
+    """Say on which agents or arcs."""
+    names = ("leader", *network.names)
+    if fault.kind == "leader lost":
+        return "the arcs from the leader"
+    if "arcs" in KEYS[fault.kind]:
+        arcs = (f"arc {names[sender]} -> {names[to]}" for sender, to in fault.arcs)
+        return ", ".join(arcs) or "all arcs"
+    return ", ".join(names[n] for n in fault.agents) or "all"
+
+
 def describe(faults: list[FaultTable], network: Network, clock: Clock) -> list[dict[str, Any]]:
     """Say for summary.json what was otherwise, when, and what is proved of it."""
     rows = []
@@ -156,7 +231,7 @@ def describe(faults: list[FaultTable], network: Network, clock: Clock) -> list[d
         rows.append(
             {
                 "kind": fault.kind,
-                "agent": ", ".join(network.names[n - 1] for n in fault.agents) or "all",
+                "agent": _where(fault, network),
                 "from": clock.time(begin),
                 "until": None if end == NEVER else clock.time(end),
                 "detail": detail,

@@ -401,15 +401,15 @@ class FaultTable:
         One of ``sensor stuck``, ``sensor bias``, ``sensor noise``, ``actuator stuck``,
         ``actuator slow``, ``messages lost``, ``leader lost``, ``arc off``, ``FMU crash``.
     at : float
-        When it begins [s].
+        When it begins [s], before the end of the run; with ``--until`` a later one is left out.
     until : float, optional
-        When it ends [s]; left out: never.
+        When it ends [s]; left out: never. Not for a crash.
     agents : list of int
         Whose sensors or actuators; default all.
     ports : list of int
         Which outputs or inputs of these, counted from 1; default all.
     arcs : list of [from, to]
-        For messages and arcs; 0 is the leader; default all.
+        For ``messages lost`` and ``arc off``; 0 is the leader; default all.
     value : float, optional
         The bias; the standard deviation of noise; the part of the way that a slow actuator goes
         in each step (0 to 1); the
