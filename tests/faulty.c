@@ -29,13 +29,13 @@ typedef struct {
     const Callbacks *callbacks;
     char name[64];
     double value[VALUES];
-    int over;
+    int over, lags;
 } Plant;
 
 enum {
     NOTHING, SEGFAULT, ABORT, EXIT, HANG, ERROR, FATAL, DISCARD, OUTSIDE, NOT_A_NUMBER, STACK,
     MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES,
-    CHANGES, OPENS, FILLS, DAEMON
+    CHANGES, OPENS, FILLS, DAEMON, SLOW
 };
 
 static int instances;
@@ -146,6 +146,10 @@ static int go_wrong(Plant *p)
         if (chdir("/"))
             abort();
         break;
+    case SLOW: /* here, and when it is read */
+        usleep(900000);
+        p->lags = 1;
+        break;
     case ONCE: { /* the first time that a process of this folder gets here */
         const char *mark = getenv("POSMAS_TEST_MARK");
         if (mark && open(mark, O_CREAT | O_EXCL, 0600) >= 0)
@@ -207,6 +211,9 @@ int fmi2GetReal(Component c, const unsigned *references, size_t n, double *value
     Plant *p = c;
     if (p->value[FAULT] == EXIT_READING && p->value[AT] == 0)
         _exit(9);
+    if (p->lags)
+        usleep(900000);
+    p->lags = 0;
     for (size_t k = 0; k < n; k++)
         values[k] = p->value[references[k]];
     return 0;

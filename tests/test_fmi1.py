@@ -87,7 +87,7 @@ def test_they_are_tried(fmus: dict[str, Path], kind: str, code: str) -> None:
     assert made.verdict == "fine", made.findings
     codes = {finding.code for finding in made.findings}
     assert {"fmi1", "no-saved-state", code} <= codes
-    assert made.results["steps"] == 50
+    assert made.results["steps"] > 10  # as many as two seconds allow
     assert made.results["repeat_noise"] == 0.0
     assert ("reset_noise" in made.results) == (kind == "cs")
     assert made.results["control"]

@@ -393,7 +393,11 @@ def test_descriptions_that_cannot_be_used(
 
 def test_a_binary_that_does_not_load(tmp_path: Path, temporary: Path, path: Path) -> None:
     here = Path.cwd()
-    for content in (b"", b"\x7fELF garbage"):
+    with zipfile.ZipFile(path) as archive:
+        name = next(n for n in archive.namelist() if n.startswith("binaries/"))
+        library = archive.read(name)
+    other = library[:18] + b"\x08\x00" + library[20:]  # ELF: for another processor
+    for content in (b"", b"\x7fELF garbage", library[: len(library) // 2], other):
         bad = changed(
             path,
             tmp_path / "bad.fmu",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from test_fmu_instance import described
 from posmas_fmi import load, run
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.errors import FmuCallError, FmuError, InputError
+from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.start_values import settable
 
@@ -106,3 +108,31 @@ def test_pending_is_explained(tmp_path: Path) -> None:
     with FmuFile(tank_fmu(tmp_path, 2)) as file, file.instantiate("a") as instance:
         error = instance.status_error("DoStep", 5, ())
     assert "5 (Pending), as if the call went on by itself; such asynchronous" in str(error)
+
+
+MORE = b"""<Binary name="frame" valueReference="7" causality="input" mimeType="image/png"/>
+    <Binary name="seen" valueReference="8" causality="output"/>
+    <String name="label" valueReference="9" causality="output"/>
+  </ModelVariables>"""
+ABLE = b'canHandleVariableCommunicationStepSize="true"'
+TERMINALS = b'<!DOCTYPE a [<!ENTITY b "x">]><a>&b;</a>'  # nobody reads it
+
+
+def test_what_is_not_used_does_no_harm_and_is_listed(sized: Path, tmp_path: Path) -> None:
+    """FMI 3: intermediate updates, terminals, binary variables, layered standards."""
+    path = described(sized, tmp_path / "more.fmu", b"</ModelVariables>", MORE)
+    flags = ABLE + b' providesIntermediateUpdate="true" mightReturnEarlyFromDoStep="true"'
+    path = described(path, tmp_path / "most.fmu", ABLE, flags)
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("terminalsAndIcons/terminalsAndIcons.xml", TERMINALS)
+        archive.writestr("extra/org.example/manifest.xml", "<a/>")
+    plain, made = check_fmu(sized), check_fmu(path)
+    assert made.exit_code == plain.exit_code < 3, [str(f) for f in made.findings]
+    told = {(f.code, f.place) for f in made.findings}
+    for place in ("Co-Simulation", "terminalsAndIcons", "extra"):
+        assert ("not-used", place) in told
+    kinds = [f"{f.place}: {f.message}" for f in made.findings if f.code == "kinds-unused"]
+    assert any("frame" in text for text in kinds)
+    assert any("seen" in text for text in kinds)
+    scenario = one_fmu(tmp_path, path, '"u[1]"', '"y[1]"')
+    assert run(load(scenario), tmp_path / "out", report=False).summary["steps"] == 10

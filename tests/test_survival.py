@@ -245,6 +245,26 @@ def test_a_worker_that_is_killed_from_outside(fmu: Path) -> None:
     assert outcome.incidents[0].signal == signal.SIGKILL
 
 
+@pytest.mark.parametrize("loop", ["c", "numpy"])
+def test_a_worker_is_woken_once_in_a_step(fmu: Path, loop: Any) -> None:
+    """However many instances it has."""
+    system = faulty_system(n=8)
+    with faulty_plant(fmu, {}, isolation(), n=8) as plant:
+        worker = plant._instances[0].worker
+        before = worker.head.bell
+        outcome = engine.run(system, plant, choice=engine.choose(system.law, loop))
+        rung = worker.head.bell - before
+    assert (outcome.ended, outcome.steps) == ("complete", 20)
+    assert 20 <= rung <= 20 + 8  # and for the first readings
+
+
+def test_the_deadline_is_of_one_call(fmu: Path) -> None:
+    """A step and the reading after it together take longer than one call may."""
+    with faulty_plant(fmu, {0: values("slow", at=0.2)}, isolation(patience=1.5), n=1) as plant:
+        outcome = engine.run(faulty_system(n=1), plant)
+    assert outcome.ended == "complete", outcome.reason
+
+
 def test_a_request_may_be_larger_than_the_socket_holds(fmu: Path) -> None:
     with faulty_plant(fmu, {}, isolation()) as plant:
         worker = plant._instances[0].worker

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fmu_examples import example_1
+from fmu_examples import example_1, tank_fmu
 
 from posmas_fmi.cosim.worker.pool import Isolation, WorkerPool
 from posmas_fmi.cosim.worker.proxy import RemoteFile, built_here
@@ -68,6 +68,26 @@ def test_nothing_of_a_worker_is_left(fmu: Path) -> None:
     pool.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="reads /proc")
+def test_fmus_share_a_worker_and_each_is_loaded_once(fmu: Path, tmp_path: Path) -> None:
+    """Some FMUs take thread-local storage with every load, which runs out."""
+    other = tank_fmu(tmp_path, 2)
+    pool = WorkerPool(Isolation("process", workers=1), 6)
+    try:
+        with RemoteFile(fmu, pool.place) as first, RemoteFile(other, pool.place) as second:
+            instances = [f.instantiate(f"{k}") for k in range(3) for f in (first, second)]
+            assert len({one.worker.pid for one in instances}) == 1
+            instances[0].initialise(values([1.0, 2.0]))
+            instances[1].initialise()
+            for one in instances[:2]:
+                one.do_step(0.0, 0.01)
+            maps = Path(f"/proc/{instances[0].worker.pid}/maps").read_text().split()
+            loaded = {word for word in maps if "/binaries/" in word}
+            assert sorted(Path(name).stem for name in loaded) == ["positive_agent", "tank"]
+    finally:
+        pool.close()
 
 
 def test_only_files_that_were_built_here_count_as_such(fmu: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from posmas_fmi.fmu.about import About, Kind, read_description
 from posmas_fmi.fmu.archive import is_file_name, unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
+from posmas_fmi.fmu.check.image import ImageError, read_image
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
 from posmas_fmi.fmu.scratch import Scratch
@@ -111,7 +112,7 @@ class FmuFile:
             raise FmuError(f"expected a {self.kind} interface (it has none)", where)
         self.version = self.about.version
         self.description = self.about.description
-        self.token = str(self.description.guid)
+        self.token = str(self.description.guid or "")
         self.variables = self.about.variables
         self._variables = self.about.names
         self.folder = folder
@@ -146,6 +147,10 @@ class FmuFile:
             raise FmuError(
                 f"expected {name} among the binaries for {binaries} (the FMU has {has})", where
             )
+        try:
+            read_image(self.library.read_bytes())  # the loader crashes at one that is cut off
+        except (ImageError, OSError) as error:
+            raise FmuError(f"the binary cannot be loaded: {error}", where) from error
         self._bind(where)
 
     def _bind(self, where: str) -> None:

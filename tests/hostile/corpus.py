@@ -245,6 +245,12 @@ def _claims(data: bytes) -> bytes:
     return data[: central + 24] + struct.pack("<I", 2**32 - 2) + data[central + 28 :]
 
 
+def _hides(data: bytes) -> bytes:
+    """Let the last entry claim to be small."""
+    central = data.rindex(b"PK\x01\x02")
+    return data[: central + 24] + struct.pack("<I", 1000) + data[central + 28 :]
+
+
 def _method(data: bytes) -> bytes:
     central = data.rindex(b"PK\x01\x02")
     return data[: central + 10] + struct.pack("<H", 77) + data[central + 12 :]
@@ -277,8 +283,10 @@ ARCHIVE = [
     Defect("claims 4 GiB", "an entry claims to be huge", "fatal", "archive-size", damage=_claims),
     Defect("bomb", "300 MiB of zeros", "fatal", "archive-ratio",
            change=lambda c: [*c.items(), ("resources/zeros", _BOMB)]),
-    Defect("many entries", "more files than any FMU needs", "fatal", "archive-entries",
-           change=lambda c: [*c.items(), *((f"resources/{k}", b"") for k in range(20_001))]),
+    Defect("hidden bomb", "an entry unpacks to more than it claims", "fatal", "archive-damaged",
+           change=lambda c: [*c.items(), ("resources/zeros", bytes(8 * 2**20))], damage=_hides),
+    Defect("many entries", "60 000 files", "fatal", "archive-entries",
+           change=lambda c: [*c.items(), *((f"resources/{k}", b"") for k in range(60_000))]),
     Defect("path up", "a name with ..", "fatal", "archive-path", change=_more(("../evil", b""))),
     Defect("path absolute", "a name that begins with /", "fatal", "archive-path",
            change=_more(("/evil", b""))),
@@ -336,6 +344,11 @@ DESCRIPTION = [
     Defect("identifier empty", "an empty modelIdentifier", "fatal", "identifier-unsafe",
            change=_xml('modelIdentifier="hostile"', 'modelIdentifier=""')),
     Defect("no guid", "no GUID", "error", "token-missing", change=_xml('guid="{1}"', "")),
+    Defect("guid", "a GUID that is not that of the binary", "fatal", "no-instance", "Instantiate",
+           change=_xml('guid="{1}"', 'guid="{2}"')),
+    Defect("3 token", "FMI 3: an instantiationToken that is not that of the binary", "fatal",
+           "no-instance", "Instantiate", fmi=3,
+           change=_xml('instantiationToken="{1}"', 'instantiationToken="{2}"')),
     Defect("no variables", "no variables", "fatal", "no-variables",
            change=_xml("ModelVariables>", "Nothing>")),
     Defect("no input", "nothing to control", "warning", "no-inputs",
@@ -529,7 +542,7 @@ LIFE = [
     _odd("DoStep log-format", "it logs a dangerous format", "log-format", "DoStep"),
     _odd("DoStep log-status", "it logs a status that there is not", "log-status", "DoStep"),
     _odd("DoStep log-environment", "it logs with a wrong pointer", "log-environment", "DoStep"),
-    _odd("DoStep log-large", "it logs 256 KiB at once", "log-large", "DoStep"),
+    _odd("DoStep log-large", "it logs 8 MiB at once", "log-large", "DoStep"),
     _odd("DoStep log-thread", "it logs from another thread", "log-thread", "DoStep"),
     Defect("DoStep log-endless", "it logs for ever", "fatal", "log-endless", "DoStep"),
     _odd("DoStep folder", "it changes the working directory", "changes-folder", "DoStep"),

@@ -183,9 +183,9 @@ static int perform(Instance *i)
         i->environment = kept;
     }
     if (!strcmp(how, "log-large")) {
-        char *text = malloc(256 << 10);
-        memset(text, 'a', 256 << 10);
-        text[(256 << 10) - 1] = 0;
+        char *text = malloc(8 << 20);
+        memset(text, 'a', 8 << 20);
+        text[(8 << 20) - 1] = 0;
         say(i, 0, "events", text);
         free(text);
     }
@@ -273,8 +273,10 @@ __attribute__((destructor)) static void unloaded(void)
     at(NULL, "dlclose");
 }
 
-static Instance *made(int fmi, const char *name)
+static Instance *made(int fmi, const char *name, const char *token)
 {
+    if (token && *token && strcmp(token, "{1}"))
+        return NULL;
     Instance *i = only && is("Instantiate", "same") ? only : calloc(1, sizeof *i);
     only = i;
     i->fmi = fmi;
@@ -334,8 +336,13 @@ API fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String gui
                                   fmi2String resources, const fmi2CallbackFunctions *functions,
                                   fmi2Boolean visible, fmi2Boolean logging)
 {
-    (void)type, (void)guid, (void)resources, (void)visible, (void)logging;
-    Instance *i = made(2, name);
+    (void)type, (void)resources, (void)visible, (void)logging;
+    Instance *i = made(2, name, guid);
+    if (!i) {
+        functions->logger(functions->componentEnvironment, name, fmi2Error, "error",
+                          "this GUID is not mine");
+        return NULL;
+    }
     i->log2 = functions->logger;
     i->environment = functions->componentEnvironment;
     at(i, "Instantiate");
@@ -452,9 +459,11 @@ API fmi3Instance fmi3InstantiateCoSimulation(
     fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference *required,
     size_t n, fmi3InstanceEnvironment environment, fmi3LogMessageCallback *log, void *update)
 {
-    (void)token, (void)resources, (void)visible, (void)logging, (void)events, (void)early;
+    (void)resources, (void)visible, (void)logging, (void)events, (void)early;
     (void)required, (void)n, (void)update;
-    Instance *i = made(3, name);
+    Instance *i = made(3, name, token);
+    if (!i)
+        return NULL;
     i->log3 = log;
     i->environment = environment;
     at(i, "Instantiate");

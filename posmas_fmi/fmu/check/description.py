@@ -15,6 +15,13 @@ _SHOWN = 5  # examples in one finding
 _MANY = 50_000  # variables
 _MOST_PARSED = 300  # names of variables that FMPy's grammar reads, at 6 ms each
 _PLACE = "modelDescription.xml"
+_UNUSED = {
+    "providesIntermediateUpdate": "it can tell values during a step",
+    "canReturnEarlyAfterIntermediateUpdate": "it can be asked to return early",
+    "providesAdjointDerivatives": "it has adjoint derivatives",
+    "providesEvaluateDiscreteStates": "it can evaluate discrete states",
+}
+_FOLDERS = {"terminalsAndIcons": "terminals and icons", "extra": "files of layered standards"}
 _CAUSALITIES = {
     1: {"input", "output", "internal", "none", "local"},
     2: {"parameter", "calculatedParameter", "input", "output", "local", "independent"},
@@ -395,3 +402,23 @@ def _ports(told: Description) -> Iterator[Finding]:
         named(lambda v: v.type in ("String", "Binary") and v.causality == "input"),
         "inputs that are no numbers; they keep their start values",
     )
+    yield from _about(
+        "note",
+        "kinds-unused",
+        named(lambda v: v.type in ("String", "Binary") and v.causality == "output"),
+        "outputs that are no numbers; they are not read",
+    )
+    for interface in told.interfaces:
+        for flag, text in _UNUSED.items():
+            if interface.has(flag):
+                yield Finding("note", "not-used", interface.kind, f"{text} ({flag}): not used")
+
+
+def more_findings(names: Iterable[str]) -> list[Finding]:
+    """Return the findings about files beside the description, by their names in the archive."""
+    there = {name.split("/")[0] for name in names if "/" in name}
+    return [
+        Finding("note", "not-used", folder, f"{text}: not used")
+        for folder, text in _FOLDERS.items()
+        if folder in there
+    ]

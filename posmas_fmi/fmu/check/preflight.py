@@ -12,10 +12,14 @@ from typing import Any
 import attrs
 
 from posmas_fmi.errors import InputError
-from posmas_fmi.fmu.archive import DESCRIPTION, examine, read_entry, require_file
+from posmas_fmi.fmu.archive import DESCRIPTION, entry_names, examine, read_entry, require_file
 from posmas_fmi.fmu.check.binaries import Binary, binary_findings, read_binaries
 from posmas_fmi.fmu.check.described import Described, Description, read_description
-from posmas_fmi.fmu.check.description import description_findings, strict_findings
+from posmas_fmi.fmu.check.description import (
+    description_findings,
+    more_findings,
+    strict_findings,
+)
 from posmas_fmi.fmu.check.finding import SEVERITIES, Finding, worst
 from posmas_fmi.fmu.check.supervisor import Bounds, Outcome, Supervisor
 
@@ -142,7 +146,7 @@ def check_fmu(
         return Preflight(path, _ordered(findings))
     told = read_description(read_entry(path, DESCRIPTION))
     _names_exist(path, told, [*inputs, *outputs, *values])
-    findings += description_findings(told)
+    findings += description_findings(told) + more_findings(entry_names(path))
     if worst(findings) == "fatal":
         return Preflight(path, _ordered(findings), told)
     binaries = read_binaries(path)
