@@ -19,17 +19,19 @@ from pathlib import Path
 from typing import Any
 
 import attrs
+import hostile
 import numpy as np
 import pytest
 from faulty import faulty_fmu, faulty_plant, faulty_system, values
 
 from posmas_fmi.cli import main
 from posmas_fmi.cosim import engine
-from posmas_fmi.cosim.fmu_plant import Isolation
+from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
 from posmas_fmi.cosim.master import Outcome
 from posmas_fmi.cosim.worker.minder import Limits
 from posmas_fmi.cosim.worker.process import Patience
 from posmas_fmi.errors import FmuLostError
+from posmas_fmi.scenario.verdict import summarise
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts in /proc")
 
@@ -54,6 +56,12 @@ VERDICTS = {
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(scope="module")
+def endless() -> dict[str, Path]:
+    names = ("good 2", "DoStep fills 11", "DoStep log-endless 11")
+    return {name: hostile.path(name) for name in names}
 
 
 def isolation(on_failure: Any = "stop", patience: float = 20.0, **options: Any) -> Isolation:
@@ -150,6 +158,48 @@ def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, apart: Any, actio
     assert told[0] == told[1]
 
 
+@pytest.mark.parametrize("action", ["stop", "freeze", "restart"])
+@pytest.mark.parametrize(
+    ("defect", "told", "said"),
+    [
+        ("fills", "it wrote more to its folder for temporary files than it may", ""),
+        ("log-endless", "did not answer within 1 s", "all work and no play"),
+    ],
+)
+def test_what_has_no_end_is_a_verdict(
+    endless: dict[str, Path], defect: str, told: str, said: str, action: str
+) -> None:
+    """It fills its folder, or logs, for ever, from its 11th step on."""
+    files = [endless["good 2"], endless[f"DoStep {defect} 11"], endless["good 2"]]
+    ports = PortMap.plain(["u"]), PortMap.plain(["y"])
+    specs = [PlantSpec(file) for file in files]
+    apart = isolation(action, 1.0 if said else 20.0, workers=3)
+    rows: list[np.ndarray] = []
+    with FmuPlant.of_agents(("1", "2", "3"), specs, *ports, None, 1e9, apart) as plant:
+        outcome = engine.run(
+            faulty_system(), plant, lambda _, v: rows.append(v["y"][..., 0].copy())
+        )
+    y = np.concatenate(rows)
+    first = outcome.incidents[0]
+    assert (first.fmu, first.agent, first.call) == (files[1].name, "2", "fmi2DoStep")
+    assert (first.time, list(first.inputs)) == (0.5, ["u"])
+    assert told in first.cause
+    assert said in "".join(first.messages)
+    summary = summarise(outcome, ("1", "2", "3"), 1e-6)
+    assert told in summary["incidents"][0]["verdict"]
+    done = {"stop": "stopped", "freeze": "frozen", "restart": "restarted"}[action]
+    assert summary["incidents"][0]["action"] == done
+    if action == "stop":
+        assert (summary["verdict"], len(y)) == ("failed", 11)
+        for part in (files[1].name, ": 2: fmi2DoStep", told, "at time 0.5 s", "u = "):
+            assert part in summary["reason"]
+        return
+    assert (summary["ended"], len(y)) == ("complete", 21)
+    assert (np.diff(y[:, [0, 2]], axis=0) != 0).all(axis=1)[10:].all()
+    assert (y[11:, 1] == y[10, 1]).all() == (action == "freeze")
+    assert (summary["agents"][1]["status"] == "frozen") == (action == "freeze")
+
+
 @pytest.mark.parametrize("apart", ["process", "none"])
 @pytest.mark.parametrize("loop", ["c", "numpy"])
 def test_a_frozen_agent_stays_and_the_others_go_on(fmu: Path, apart: Any, loop: str) -> None:
@@ -197,7 +247,7 @@ def test_processes_that_an_fmu_leaves_behind_are_ended(
 ) -> None:
     outcome, _ = run(fmu, {1: values("daemon", at=0.2), 2: values("daemon", at=0.3)}, isolation())
     assert outcome.ended == "complete"
-    assert "an FMU left 2 processes behind" in caplog.text
+    assert "faulty.fmu: 1, 2 or 3 left 2 processes behind" in caplog.text
     wait_for(lambda: not working_in(tmp_path))
 
 
@@ -359,6 +409,35 @@ def test_the_command_tells_the_failure_in_all_its_files(
     else:
         assert summary["agents"][1]["status"] == "frozen"
         assert "frozen after a failure of the FMU: 2" in printed
+
+
+@pytest.mark.slow
+def test_the_command_tells_what_an_fmu_left_behind(
+    fmu: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It stood in the log only; who it was is known where each has a process of its own."""
+    path = scenario(fmu, tmp_path / "s", "daemon")
+    shared = path.read_text()
+    for workers, who in ((1, "1, 2 or 3"), (3, "2")):
+        path.write_text(shared.replace("workers = 1", f"workers = {workers}"))
+        assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 0
+        told = f"faulty.fmu: {who} left 1 process behind, which had to be ended"
+        assert told in capsys.readouterr().out
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["verdict"] == "converged"  # as without it: that is no failure
+        assert summary["incidents"] == [
+            {
+                "agent": who,
+                "fmu": "faulty.fmu",
+                "verdict": "left 1 process behind",
+                "action": "ended",
+                "processes": 1,
+            }
+        ]
+        page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+        assert f'<th scope="row">{who}</th>' in page
+        assert "faulty.fmu: left 1 process behind" in page
+        assert "an FMU that failed" not in page
 
 
 @pytest.mark.slow

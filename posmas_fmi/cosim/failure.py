@@ -8,6 +8,58 @@ from typing import Any, Literal
 import attrs
 
 Action = Literal["stopped", "frozen", "restarted"]
+ENDED = "ended"  # what is done about processes that are left behind
+_TOLD = 6  # instances
+
+
+@attrs.define
+class Leftover:
+    """Processes that FMUs had started and that were still there when theirs ended.
+
+    Attributes
+    ----------
+    instances : dict of str to str
+        Name and FMU of each instance that was in the process.
+    number : int
+        How many had to be ended; known when the process is closed.
+    """
+
+    instances: dict[str, str] = attrs.field(factory=dict)
+    number: int = 0
+
+    @property
+    def agent(self) -> str:
+        """The instance that started them; where several shared the process, which they may be.
+
+        Examples
+        --------
+        >>> Leftover({"1": "a.fmu", "2": "b.fmu", "3": "b.fmu"}).agent
+        '1, 2 or 3'
+        """
+        *others, last = self.instances or [""]
+        if len(others) >= _TOLD:
+            others = [*others[: _TOLD - 1], "…"]
+        return f"{', '.join(others)} or {last}" if others else last
+
+    @property
+    def fmu(self) -> str:
+        """Their FMU, or those that they may be of."""
+        return " or ".join(dict.fromkeys(self.instances.values()))
+
+    @property
+    def text(self) -> str:
+        """What was found, as a part of a sentence."""
+        return f"left {self.number} process{'es' if self.number > 1 else ''} behind"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what summary.json says about it, among the incidents."""
+        return {
+            "agent": self.agent,
+            "fmu": self.fmu,
+            "verdict": self.text,
+            "action": ENDED,
+            "processes": self.number,
+        }
 
 
 @attrs.frozen

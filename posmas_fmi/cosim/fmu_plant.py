@@ -16,7 +16,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim import native
-from posmas_fmi.cosim.failure import Failure
+from posmas_fmi.cosim.failure import Failure, Leftover
 from posmas_fmi.cosim.fmus import (
     READING,
     FmuLoop,
@@ -163,6 +163,7 @@ class FmuPlant:
             )
             self._remote = self._connect(isolation, pool, stack)
             self._release = stack.pop_all()
+        self._pool = pool
         self.isolated = self._remote is not None
         self.input_at, self.reading_at = self.fmus.input_at, self.fmus.reading_at
         self.frozen = np.zeros(len(specs), dtype=bool)
@@ -188,6 +189,11 @@ class FmuPlant:
     def failures(self) -> Sequence[Failure]:
         """What has failed so far."""
         return self.fmus.failures
+
+    @property
+    def leftovers(self) -> tuple[Leftover, ...]:
+        """Processes that FMUs left behind and that had to be ended; complete after `close`."""
+        return tuple(one for one in self._pool.leftovers if one.number)
 
     @classmethod
     def of_agents(

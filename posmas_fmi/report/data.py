@@ -11,6 +11,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.agent import Assumption
+from posmas_fmi.cosim.failure import ENDED
 from posmas_fmi.errors import NetworkError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
@@ -95,7 +96,7 @@ class Fault:
 
 @attrs.frozen
 class Incident:
-    """An FMU that failed while the run went on.
+    """An FMU that failed while the run went on, or left processes behind that had to be ended.
 
     `inputs` are those of the step that failed, as text; `said` is what the instance logged and its
     process wrote last; `detail` is how the others went on.
@@ -140,7 +141,8 @@ class Summary:
         """What was used or went wrong and no certificate covers."""
         used = [row.what for row in self.coverage or () if not row.covered]
         faults = [fault.kind for fault in self.faults if not fault.proved]
-        failed = ["an FMU that failed"] if self.incidents else []
+        fails = any(incident.action != ENDED for incident in self.incidents)
+        failed = ["an FMU that failed"] if fails else []
         return tuple(dict.fromkeys([*used, *faults, *failed]))
 
 

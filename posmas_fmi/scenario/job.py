@@ -19,6 +19,7 @@ import numpy as np
 from posmas_fmi.certify.certificate import Verdict
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.conditions import Sensors
+from posmas_fmi.cosim.failure import Leftover
 from posmas_fmi.cosim.fmu_plant import FmuPlant
 from posmas_fmi.cosim.law import Law, ProtocolLaw
 from posmas_fmi.cosim.master import Iteration, Outcome, Progress, System
@@ -236,10 +237,10 @@ def _run_in(
         write_json(folder / "manifest.json", told)
 
     began = time.perf_counter()
-    outcome, baseline = _simulate(
+    outcome, baseline, left = _simulate(
         scenario, designed, instances, choice, folder, progress, started, beginning
     )
-    summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance)
+    summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance, left)
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
         summary["faults"] = describe(list(scenario.faults), designed.network, scenario.clock)
@@ -272,8 +273,11 @@ def _simulate(
     progress: Callable[[str], Progress | None],
     started: Callable[[FmuPlant], None],
     beginning: Beginning,
-) -> tuple[Outcome, Outcome | None]:
-    """Run with the design, then once more without control for comparison."""
+) -> tuple[Outcome, Outcome | None, tuple[Leftover, ...]]:
+    """Run with the design, then once more without control for comparison.
+
+    The last of the result is what the FMUs left behind in the run with the design.
+    """
     recorded, baselines = tuple(scenario.record.variables), scenario.baseline
     with_baseline = baselines and "x" in recorded
     variables = (*recorded, "x_baseline") if with_baseline else recorded
@@ -311,7 +315,7 @@ def _simulate(
             )
         if outcome.ended in ("complete", "terminated"):
             recorder.finish()
-    return outcome, baseline
+    return outcome, baseline, plant.leftovers
 
 
 def _without_control(

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+from posmas_fmi.cosim.failure import Leftover
 from posmas_fmi.cosim.master import Outcome
 
 NEGATIVE = -1e-9  # a state above this counts as non-negative: the noise of the integration
 
 
-def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dict[str, Any]:
+def summarise(
+    outcome: Outcome,
+    names: tuple[str, ...],
+    tolerance: float,
+    left: Sequence[Leftover] = (),
+) -> dict[str, Any]:
     """Return the content of summary.json but for the wall time.
 
     Parameters
@@ -20,6 +27,8 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         Of the agents.
     tolerance : float
         Largest final tracking error that counts as converged.
+    left : sequence of Leftover
+        Processes that FMUs left behind: incidents too, though no failures.
 
     Returns
     -------
@@ -41,7 +50,8 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         }
         for k, name in enumerate(names)
     ]
-    reasons = (_frozen_reason(outcome), _unsettled_reason(outcome))
+    incidents = [failure.to_dict() for failure in outcome.incidents]
+    reasons = (_frozen_reason(outcome), _unsettled_reason(outcome), _left_reason(left))
     noise, iterated = outcome.replay_noise, outcome.replay_noise is not None
     return {
         **({} if noise is None else {"replay_noise": _finite(noise)}),
@@ -57,7 +67,7 @@ def summarise(outcome: Outcome, names: tuple[str, ...], tolerance: float) -> dic
         "time": outcome.time,
         "messages_sent": outcome.messages,
         "messages_lost": outcome.lost,
-        "incidents": [failure.to_dict() for failure in outcome.incidents],
+        "incidents": [*incidents, *(one.to_dict() for one in left)],
     }
 
 
@@ -115,6 +125,10 @@ def _unsettled_reason(outcome: Outcome) -> str:
         f"the coupling of FMUs did not settle in {outcome.unsettled} of {outcome.steps} steps: "
         "what they show is not that of the coupled system"
     )
+
+
+def _left_reason(left: Sequence[Leftover]) -> str:
+    return "; ".join(f"{one.fmu}: {one.agent} {one.text}, which had to be ended" for one in left)
 
 
 def _frozen(outcome: Outcome) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import attrs
 
+from posmas_fmi.cosim.failure import Leftover
 from posmas_fmi.cosim.worker.minder import Limits
 from posmas_fmi.cosim.worker.process import Patience, WorkerProcess
 from posmas_fmi.cosim.worker.proxy import RemoteFile, built_here
@@ -66,9 +67,12 @@ class WorkerPool:
     ----------
     spins : int
         How often master and workers look before they sleep; 0 where processors are short.
+    leftovers : list of Leftover
+        Of each process that was started.
     """
 
     def __init__(self, isolation: Isolation, instances: int) -> None:
+        self.leftovers: list[Leftover] = []
         self._isolation = isolation
         cores = processors()
         self._most = max(1, min(isolation.workers or cores, instances))
@@ -84,6 +88,7 @@ class WorkerPool:
         """Start one more process."""
         worker = WorkerProcess(self._isolation.limits, self._isolation.patience, self.spins)
         self._all.append(worker)
+        self.leftovers.append(worker.leftover)
         return worker
 
     def place(self, file: RemoteFile, alone: bool = False) -> WorkerProcess:

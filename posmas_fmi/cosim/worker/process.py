@@ -21,6 +21,7 @@ import attrs
 import posmas_fmi
 from posmas_fmi import errors
 from posmas_fmi.cosim import native
+from posmas_fmi.cosim.failure import Leftover
 from posmas_fmi.cosim.fmus import DEADLINE, DIED, NativeMessages
 from posmas_fmi.cosim.worker import frames, layout
 from posmas_fmi.cosim.worker.minder import REASONS, Limits
@@ -107,6 +108,8 @@ class WorkerProcess:
     ----------
     entry : layout.Worker
         What the C loop knows about it.
+    leftover : Leftover
+        What its FMUs left behind; complete when it is closed.
     """
 
     def __init__(self, limits: Limits, patience: Patience, spins: int) -> None:
@@ -156,8 +159,9 @@ class WorkerProcess:
         self.messages = NativeMessages(self._library, shared.messages)
         self.entry = layout.Worker(ctypes.addressof(self.head), self._process.pid)
         ask = (self._library.remote_ask, self.entry, self.head)
+        self.leftover = Leftover()
         self._end = weakref.finalize(
-            self, _release, self._process, ask, ours, output, scratch, mark
+            self, _release, self._process, ask, ours, output, scratch, mark, self.leftover
         )
 
     @property
@@ -283,6 +287,7 @@ def _release(
     output: int,
     scratch: Scratch,
     mark: str,
+    leftover: Leftover,
 ) -> None:
     try:
         if process.poll() is None:
@@ -297,10 +302,11 @@ def _release(
     finally:
         link.close()
         os.close(output)
-        left = end_marked(mark)
+        leftover.number = end_marked(mark)
         scratch.cleanup()
-    if left:
-        _LOG.warning("an FMU left %d processes behind; they were ended", left)
+    if leftover.number:
+        who = f"{leftover.fmu or 'an FMU'}: {leftover.agent}"
+        _LOG.warning("%s %s; ended", who.removesuffix(": "), leftover.text)
 
 
 def _say_goodbye(link: socket.socket) -> None:

@@ -124,6 +124,7 @@ class RemoteInstance(FmuInstance):
     def make(self, worker: WorkerProcess) -> None:
         """Be a fresh instance in that worker process."""
         self.worker = worker
+        worker.leftover.instances[self.name] = self.file.path.name
         path = str(self.file.path.absolute())  # the worker is in another folder
         with _Lost(self):
             worker.load(path, str(self.file.folder), self.file.about.structure)
