@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from fmpy import read_model_description
 from fmu_examples import tank_fmu
 from hypothesis import given
 from hypothesis import strategies as st
 
-from posmas_fmi.errors import InputError
-from posmas_fmi.fmu.description import UNITS
+from posmas_fmi.errors import BuildError, InputError
+from posmas_fmi.fmu.description import model_description
 from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.model import FmuModel, Variable
 from posmas_fmi.fmu.units import BASES, Conversion, Units, parse_unit
 
 
@@ -144,11 +147,36 @@ def test_there_and_back_is_the_same(a: str, b: str, value: float) -> None:
     assert returned == pytest.approx(value, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("name", UNITS)
-def test_the_units_of_generated_fmus_are_what_their_names_say(name: str) -> None:
-    unit = parse_unit(name)
-    exponents = tuple(int(UNITS[name].get(base, 0)) for base in BASES)
-    assert (unit.exponents, unit.factor, unit.offset) == (exponents, 1, 0)
+THERMAL = (
+    *("1", "%", "s", "h", "K", "degC", "degF", "W", "kW", "J", "kWh", "J/(kg.K)", "kJ/(kg.K)"),
+    *("W/K", "kW/K", "W/(m2.K)", "kg/s", "kg/h", "t/h", "m3/s", "m3/h", "L/min", "L/s"),
+    *("Pa", "kPa", "bar", "mbar", "psi", "rpm", "Hz", "1/K", "m", "m2", "m3", "kg/m3", "Pa.s"),
+)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_the_units_of_generated_fmus_are_what_their_names_say(tmp_path: Path, fmi: Any) -> None:
+    """Also those of the rates of their states; as FMPy reads them."""
+    variables = [Variable(f"x{k}", "state", (), (0.0,), unit) for k, unit in enumerate(THERMAL)]
+    model = FmuModel("units", "", tuple(variables), {})
+    path = tmp_path / "modelDescription.xml"
+    path.write_bytes(model_description(model, fmi, ["a.c"]))
+    description = read_model_description(str(tmp_path), validate=True)
+    defined = Units.read(description).defined
+    for variable in model.table:
+        unit, expected = defined[variable.unit], parse_unit(variable.unit)
+        assert unit.exponents == expected.exponents
+        assert float(unit.factor) == float(expected.factor)
+        assert float(unit.offset) == float(expected.offset)
+    assert float(defined["kPa/s"].factor) == 1000.0
+    assert defined["degC/s"].offset == 0
+
+
+@pytest.mark.parametrize("unit", ["furlong", "kPa/s/m", "", 7])
+def test_a_unit_that_is_none_names_variable_and_remedy(unit: Any) -> None:
+    told = r"'gap'.*expected a unit like kg/s|gap: expected a unit as text \(got 7\)"
+    with pytest.raises(BuildError, match=told):
+        model_description(FmuModel("units", "", (Variable("gap", "output", unit=unit),), {}), 3, [])
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

@@ -5,30 +5,10 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 
-from posmas_fmi.errors import BuildError
+from posmas_fmi.errors import BuildError, InputError
 from posmas_fmi.fmu.model import FmuModel, Variable
 from posmas_fmi.fmu.sources import FmiVersion, instantiation_token
-
-# Name of a unit -> exponents of the SI base units, and the factor to them.
-UNITS: dict[str, dict[str, float]] = {
-    "1": {},
-    "1/s": {"s": -1},
-    "s": {"s": 1},
-    "K": {"K": 1},
-    "K/s": {"K": 1, "s": -1},
-    "1/K": {"K": -1},
-    "J": {"kg": 1, "m": 2, "s": -2},
-    "J/s": {"kg": 1, "m": 2, "s": -3},
-    "J/(kg.K)": {"m": 2, "s": -2, "K": -1},
-    "W": {"kg": 1, "m": 2, "s": -3},
-    "W/K": {"kg": 1, "m": 2, "s": -3, "K": -1},
-    "J/K": {"kg": 1, "m": 2, "s": -2, "K": -1},
-    "kg/s": {"kg": 1, "s": -1},
-    "kg": {"kg": 1},
-    "m3": {"m": 3},
-    "m3/s": {"m": 3, "s": -1},
-    "Pa": {"kg": 1, "m": -1, "s": -2},
-}
+from posmas_fmi.fmu.units import BASES, Unit, parse_unit
 
 _GENERATOR = "posmas-fmi"
 
@@ -51,7 +31,7 @@ def model_description(model: FmuModel, fmi: FmiVersion, sources: Sequence[str]) 
     Raises
     ------
     BuildError
-        If a unit is not in `UNITS`.
+        If a unit is not known.
     """
     root = _fmi2(model, sources) if fmi == 2 else _fmi3(model)
     return _bytes(root)
@@ -75,11 +55,26 @@ def _bytes(root: ET.Element) -> bytes:
 
 def _units(root: ET.Element, model: FmuModel) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
-    for name in sorted({"s", *(v.unit for v in model.table)}):
-        if name not in UNITS:
-            raise BuildError(f"the unit {name!r} is not in the table of units", model.name)
-        unit = ET.SubElement(definitions, "Unit", name=name)
-        ET.SubElement(unit, "BaseUnit", {base: str(e) for base, e in UNITS[name].items()})
+    for name, unit in sorted({"s": parse_unit("s"), **_units_of(model)}.items()):
+        powers = zip(BASES, unit.exponents, strict=True)
+        attributes = {base: str(e) for base, e in powers if e}
+        if unit.factor != 1:
+            attributes["factor"] = repr(float(unit.factor))
+        if unit.offset:
+            attributes["offset"] = repr(float(unit.offset))
+        element = ET.SubElement(definitions, "Unit", name=name)
+        ET.SubElement(element, "BaseUnit", attributes)
+
+
+def _units_of(model: FmuModel) -> dict[str, Unit]:
+    found = {}
+    for variable in model.table:
+        try:
+            found[variable.unit] = parse_unit(variable.unit)
+        except InputError as error:
+            what = f"the unit of {variable.name!r}: {error.message}; or 1, and the factor in C"
+            raise BuildError(what, model.name) from None
+    return found
 
 
 def _log_categories(root: ET.Element) -> None:

@@ -30,7 +30,7 @@ class Variable:
     start : tuple of float
         Row-major start values of a parameter, input or state; empty for what is computed.
     unit : str
-        A key of `posmas_fmi.fmu.description.UNITS`.
+        As `posmas_fmi.fmu.units.parse_unit` reads it: ``K``, ``kPa``, ``L/min``, ``W/(m2.K)``.
     description : str
         One line.
     nominal : float
@@ -52,6 +52,8 @@ class Variable:
     def __attrs_post_init__(self) -> None:
         if self.role not in ROLES:
             raise BuildError(f"expected one of {', '.join(ROLES)} (got {self.role!r})", self.name)
+        if not isinstance(self.unit, str):
+            raise BuildError(f"expected a unit as text (got {self.unit!r})", self.name)
         if self.needs_start and len(self.start) != self.size:
             raise BuildError(f"expected {self.size} start values (got {self.start})", self.name)
         if not self.needs_start and self.start:
@@ -194,4 +196,12 @@ class FmuModel:
 
 
 def _per_second(unit: str) -> str:
-    return "1/s" if unit == "1" else f"{unit}/s"
+    """Return the unit of a rate; a unit has one stroke at most.
+
+    Examples
+    --------
+    >>> [_per_second(unit) for unit in ("1", "K", "m3/h", "J/(kg.K)")]
+    ['1/s', 'K/s', 'm3/(h.s)', 'J/(kg.K.s)']
+    """
+    above, stroke, below = unit.partition("/")
+    return f"{above}/({below.strip('()')}.s)" if stroke else f"{above}/s"

@@ -38,7 +38,8 @@ def read_plant(folder: Path) -> FmuModel:
         - ``[agent]``, from which model (1) is generated: A, H, B, C, g, sec, x; or
         - ``[[variable]]`` tables with the attributes of `posmas_fmi.fmu.model.Variable`; then the C
           files in the folder define the functions of ``csrc/model.h``, parameters, inputs, states
-          and outputs in the order of the tables.
+          and outputs in the order of the tables. A ``unit`` is one that
+          `posmas_fmi.fmu.units.parse_unit` reads.
 
     Raises
     ------
