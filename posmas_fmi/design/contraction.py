@@ -13,8 +13,8 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.certify import Loop
 from posmas_fmi.certify.closed_loop import Prover
 from posmas_fmi.certify.loop import Feedback
+from posmas_fmi.design.certified import certified
 from posmas_fmi.design.explain import clash
-from posmas_fmi.design.gains import certified
 from posmas_fmi.design.program import Problem, Solution, alternate
 from posmas_fmi.design.result import Design
 from posmas_fmi.design.rounding import nearest, towards_zero

@@ -16,11 +16,12 @@ import attrs
 import numpy as np
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.certify import Loop, baseline
+from posmas_fmi.certify import Loop, baseline, certify_loop
 from posmas_fmi.certify.certificate import Certificate
 from posmas_fmi.certify.diverging import divergence
 from posmas_fmi.certify.quadratic import GraphScalar, lipschitz_norm, step_of, symmetric_scalar
-from posmas_fmi.design.gains import checked_gains, loop_of
+from posmas_fmi.design.certified import checked_gains, loop_of
+from posmas_fmi.design.contraction import observer_gain
 from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.integral_certificate import certificate, refuting
 from posmas_fmi.design.integral_gains import (
@@ -124,8 +125,6 @@ def certify(
         )
     loop = loop_of(agent, network, K, E, settings, period)
     if network.unreached() or loop.protocol == "printed":
-        from posmas_fmi.certify import certify_loop
-
         failed = IntegralDesign(K, settings.K_q, np.eye(1), 0.0, no_graph(), nothing())
         return _result(settings, failed, loop, certify_loop(loop), names)
     if period is not None:
@@ -199,9 +198,7 @@ def _with_observer(
     K: Array,
     rate: float,
 ) -> Loop:
-    from posmas_fmi.design import contraction
-
-    E = contraction.observer_gain(agent, network, settings, period, rate)
+    E = observer_gain(agent, network, settings, period, rate)
     return loop_of(agent, network, K, E, settings, period)
 
 

@@ -34,7 +34,7 @@ from posmas_fmi.certify.quadratic import (
     mismatch,
     symmetric_scalar,
 )
-from posmas_fmi.design.gains import certified, loop_of
+from posmas_fmi.design.certified import certified, loop_of
 from posmas_fmi.design.graph_scalar import graph_scalar
 from posmas_fmi.design.result import Design
 from posmas_fmi.design.rounding import nearest, towards_zero

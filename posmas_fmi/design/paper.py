@@ -14,7 +14,7 @@ import numpy as np
 
 from posmas_fmi.agent import Agent
 from posmas_fmi.design import lmi
-from posmas_fmi.design.gains import certified
+from posmas_fmi.design.certified import certified
 from posmas_fmi.design.result import Design
 from posmas_fmi.design.rounding import nearest
 from posmas_fmi.design.settings import DesignSettings, Reading

@@ -12,9 +12,9 @@ import numpy as np
 
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
-from posmas_fmi.network import Network
 from posmas_fmi.report.foreign import AGAIN, clean, number
 from posmas_fmi.report.json_files import read_json
+from posmas_fmi.report.kpi_signals import Signals, read_signals
 
 BAND = 1.0  # K, where the run does not state its own
 SAME = 0.05  # relative: figures this close to each other count as equal
@@ -46,40 +46,6 @@ class Limit:
         if value is None:
             return None
         return value >= self.limit if self.above else value <= self.limit
-
-
-@attrs.frozen(eq=False)
-class Signals:
-    """What was recorded with one controller; arrays over time and line, (T, N), or None.
-
-    Attributes
-    ----------
-    time : (T,) array
-        [s]
-    deviation : (T, N) array
-        Supply temperature minus its set-point [K].
-    supply, valve, case, heat : (T, N) array or None
-        Supply temperature [K], valve position (0 to 1), case temperature [K], heat load [W].
-    set_point, facility : (T, 1) or (T, N) array or None
-        [K]
-    """
-
-    time: Array
-    names: tuple[str, ...]
-    network: Network
-    deviation: Array
-    supply: Array
-    set_point: Array
-    facility: Array | None
-    valve: Array | None
-    case: Array | None
-    heat: Array | None
-    stride: int
-
-    @property
-    def N(self) -> int:
-        """Number of lines."""
-        return int(self.deviation.shape[1])
 
 
 @attrs.frozen(eq=False)
@@ -181,8 +147,6 @@ def read_kpis(folder: Path) -> KpiRun:
     InputError
         If a file is missing or cannot be used.
     """
-    from posmas_fmi.report.kpi_signals import read_signals
-
     path = folder / "summary.json"
     content = read_json(path)
     comparison = _objects(content, "comparison", path)

@@ -9,7 +9,8 @@ import numpy as np
 
 from posmas_fmi.expression import Array
 from posmas_fmi.report.figures import DASHES, thin
-from posmas_fmi.report.kpi_data import Controller, KpiRun, Signals, largest
+from posmas_fmi.report.kpi_data import Controller, KpiRun, largest
+from posmas_fmi.report.kpi_signals import Signals
 from posmas_fmi.report.svg import BLACK, BLUE, CYCLE, GREY, ORANGE, SKY, VERMILION, look, to_svg
 
 if TYPE_CHECKING:

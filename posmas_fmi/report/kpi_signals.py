@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 
 from posmas_fmi.expression import Array
 from posmas_fmi.netcdf import NetcdfFile
+from posmas_fmi.network import Network
 from posmas_fmi.report.foreign import number
-from posmas_fmi.report.kpi_data import Signals
 from posmas_fmi.report.results_file import (
     open_results,
     read_labels,
@@ -24,6 +25,40 @@ _WANTED = (
     *("supply_temperature", "set_point", "facility_temperature"),
     *("valve_position", "case_temperature", "heat_load"),
 )
+
+
+@attrs.frozen(eq=False)
+class Signals:
+    """What was recorded with one controller; arrays over time and line, (T, N), or None.
+
+    Attributes
+    ----------
+    time : (T,) array
+        [s]
+    deviation : (T, N) array
+        Supply temperature minus its set-point [K].
+    supply, valve, case, heat : (T, N) array or None
+        Supply temperature [K], valve position (0 to 1), case temperature [K], heat load [W].
+    set_point, facility : (T, 1) or (T, N) array or None
+        [K]
+    """
+
+    time: Array
+    names: tuple[str, ...]
+    network: Network
+    deviation: Array
+    supply: Array
+    set_point: Array
+    facility: Array | None
+    valve: Array | None
+    case: Array | None
+    heat: Array | None
+    stride: int
+
+    @property
+    def N(self) -> int:
+        """Number of lines."""
+        return int(self.deviation.shape[1])
 
 
 def read_signals(path: Path, summary: Mapping[str, Any]) -> Signals | None:
