@@ -109,6 +109,27 @@ def test_the_scenario_of_the_tutorial_runs(tmp_path):
     assert 0.2 < made.certificate.rate < 0.23
 
 
+def test_every_promise_about_fmus_names_tests_that_are_there():
+    """The page of promises: each row names tests or hostile FMUs, and all of them exist."""
+    import hostile
+
+    page = (ROOT / "docs" / "master.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (?!promise)(.+) \| (.+) \|$", page, re.M)
+    assert len(rows) > 80
+    defects = {defect.name for defect in hostile.DEFECTS}
+    for promise, shown in rows:
+        names = re.findall(r"`([^`]+)`", shown)
+        assert names, promise
+        assert shown == ", ".join(f"`{name}`" for name in names), promise
+        for name in names:
+            if name.startswith("hostile: "):
+                assert name.removeprefix("hostile: ") in defects, f"{promise}: {name}"
+                continue
+            file, _, test = name.partition("::")
+            code = (ROOT / "tests" / file).read_text(encoding="utf-8")
+            assert re.search(rf"^def {test}\(", code, re.M), f"{promise}: {name}"
+
+
 @pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
     site = tmp_path / "site"

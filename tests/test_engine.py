@@ -451,6 +451,27 @@ def test_an_fmu_that_never_gets_to_the_end(tmp_path: Path, monkeypatch: pytest.M
     assert "returned early at 0.0 s" in outcome.reason
 
 
+SETS = "    return instance ? (fmi3Status)instance_set(INSTANCE(instance), valueReferences,"
+GETS = "    return instance ? (fmi3Status)instance_get(INSTANCE(instance), valueReferences,"
+
+
+@pytest.mark.parametrize("where", ["none", "process"])
+@pytest.mark.parametrize("which", ["c", "numpy"])
+def test_nothing_is_read_between_an_input_and_the_step(
+    which: str, where: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The FMU refuses what the standard forbids in Step Mode."""
+    running = "INSTANCE(instance)->state.mode == MODE_STEP"
+    set_now = f"    if ({running})\n        INSTANCE(instance)->state.unused = 1;\n"
+    refuse = f"    if ({running} && INSTANCE(instance)->state.unused)\n        return fmi3Error;\n"
+    changed(monkeypatch, 3, SETS, set_now + SETS)
+    changed(monkeypatch, 3, GETS, refuse + GETS)
+    changed(monkeypatch, 3, STEP, "    INSTANCE(instance)->state.unused = 0;\n" + STEP)
+    case = Fragile(isolation=Isolation(where))
+    outcome, _ = run(case, tmp_path, which)
+    assert outcome.ended == "complete", outcome.reason
+
+
 def test_an_fmu_that_gives_no_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     call = "first.environment = functions->componentEnvironment;"
     why = (

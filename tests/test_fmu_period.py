@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,8 @@ from test_fmu_instance import described
 
 from posmas_fmi import load, run
 from posmas_fmi.errors import ScenarioError
+from posmas_fmi.fmu.archive import read_entry
+from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.period import (
     Experiment,
@@ -133,3 +136,19 @@ def test_the_nearest_period_is_told_with_all_digits(container: Path) -> None:
         reason = check_period(file, 0.016666667).reason
     assert "0.016666667 s is no whole multiple" in reason
     assert "the nearest is 0.016666666666666666 s" in reason
+
+
+def test_check_takes_the_steps_of_the_default_experiment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = "communicationStepSize != 0.25 || currentCommunicationPoint < 5.0"
+    refuse = f"    if ({other})\n        return fmi3Error;\n"
+    test_engine.changed(monkeypatch, 3, test_engine.STEP, refuse + test_engine.STEP)
+    text = read_entry(tank_fmu(tmp_path, 3), "modelDescription.xml")
+    old = re.search(rb"<DefaultExperiment[^>]*>", text)
+    assert old is not None
+    new = b'<DefaultExperiment startTime="5" stopTime="50" stepSize="0.25"/>'
+    path = described(tank_fmu(tmp_path, 3), tmp_path / "later.fmu", old.group(), new)
+    made = check_fmu(path, control=False)
+    assert made.exit_code == 0, [str(f) for f in made.findings]
+    assert made.results["steps"] > 10

@@ -80,6 +80,21 @@ def test_nothing_is_said_where_all_is_as_asked(pump: Path) -> None:
         assert read_back(instance, values) == []
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_inputs_are_set_before_and_in_initialisation(tmp_path: Path, fmi: int) -> None:
+    """What is computed from them in Initialization Mode must know them."""
+    calls: list[str] = []
+    path = tank_fmu(tmp_path, fmi)
+    with FmuFile(path, trace=calls.append) as file, file.instantiate("a") as instance:
+        del calls[:]
+        instance.initialise({"loss": 1.0, "power": 7.0})
+        order = [call[4:] for call in calls if call != "fmi2SetupExperiment"]
+    sets = "SetReal" if fmi == 2 else "SetFloat64"
+    begin, end = order.index("EnterInitializationMode"), order.index("ExitInitializationMode")
+    assert set(order[:begin]) == {sets}
+    assert order[begin + 1 : end] == [sets]
+
+
 def scenario(pump: Path, folder: Path, parameters: str) -> str:
     return one_fmu(folder, pump, '"u"', '"y"', f"parameters = {{{parameters}}}")
 

@@ -59,7 +59,7 @@ def plant_toml(
         for k, name in enumerate(names):
             factor = float(input_scale[k]) if input_scale and letter == "u" else 1.0
             port = f"variable = {json.dumps(name)}, scale = {factor!r}"
-            port += f", offset = {float(offset[k])!r}"
+            port += f", offset = {float(offset[k]) + 0.0!r}"
             lines.append(f"{letter}{k + 1} = {{ {port} }}")
     if values:
         lines += ["", "[plant.parameters]"]

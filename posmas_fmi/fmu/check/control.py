@@ -307,7 +307,7 @@ def lines(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for value in report.get("growing", []):
         yield "NOT STABLE", f"a mode grows e-fold in {value:.3g} s"
     for wave in report.get("oscillations", []):
-        yield "oscillation", f"period {wave['period']:.3g} s, damping {wave['damping']:.2g}"
+        yield "oscillation", f"period {wave['period']:.3g} s, damping {wave['damping'] + 0.0:.2g}"
     if report.get("unseen"):
         text = ", ".join(report["unseen"])
         yield "not seen", f"{text}: on no output; a smaller model does without"

@@ -393,7 +393,8 @@ def _ports(told: Description) -> Iterator[Finding]:
         "note",
         "structural",
         named(lambda v: v.causality == "structuralParameter"),
-        "{n} that change the sizes of arrays; they stay as they are",
+        "{n} that change the sizes of arrays; here they stay as they are: a scenario may give "
+        "others, as parameters",
     )
     yield from _about("note", "clocks", named(lambda v: v.type == "Clock"), "{n} that are clocks")
     yield from _about(
