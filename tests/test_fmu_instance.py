@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import hostile
 import numpy as np
 import pytest
 from fmu_examples import example_1, named, tank_fmu, vector
@@ -87,6 +88,13 @@ def test_a_wrong_token_is_refused_with_the_reason(path: Path, tmp_path: Path) ->
     assert wrong in str(caught.value)
     assert caught.value.where.startswith("other.fmu: agent 3: fmi")
     assert caught.value.exit_code == 3
+
+
+@pytest.mark.parametrize("name", ["guid", "3 token"])
+def test_an_fmu_that_gives_no_instance_is_asked_why(name: str) -> None:
+    """FMUs of PythonFMU, for one, tell what is missing only when they are asked to log."""
+    with FmuFile(hostile.path(name)) as file, pytest.raises(FmuCallError, match="is not mine"):
+        file.instantiate("a")
 
 
 def test_an_unknown_value_reference_is_refused(path: Path, tmp_path: Path) -> None:

@@ -72,6 +72,7 @@ class FmuFile:
 
     kind: Kind = "Co-Simulation"
     events = False  # whether its instances use Event Mode and may return early
+    _logs = False  # whether instances are asked to log more than errors
 
     def __init__(
         self,
@@ -207,6 +208,10 @@ class FmuFile:
             self._messages, callbacks_for(self.version, self._messages, key)
         )
         live.component = self._instantiate(name, key, live.callbacks) or 0
+        if not live.component and not self._messages.of(key):
+            self._logs = True  # asked once more, for the reason: many tell it only then
+            live.component = self._instantiate(name, key, live.callbacks) or 0
+            self._logs = False
         if not live.component:
             del self._live[key]
             raise FmuCallError(
@@ -237,7 +242,7 @@ class FmuFile:
         if self.version == 2:
             arguments: tuple[Any, ...] = (
                 *(text, 1, token, self._resources),
-                *(ctypes.byref(callbacks), 0, 0),  # neither visible nor debug logging
+                *(ctypes.byref(callbacks), 0, int(self._logs)),  # not visible
             )
             function = "fmi2Instantiate"
         else:
@@ -245,7 +250,7 @@ class FmuFile:
 
             arguments = (
                 *(text, token, self._resources),
-                *(False, False),  # neither visible nor debug logging
+                *(False, self._logs),  # not visible
                 *(self.events, self.events, None, 0),  # event mode, early return; no variables
                 *(self._messages.environment(key), callbacks, fmi3IntermediateUpdateCallback()),
             )

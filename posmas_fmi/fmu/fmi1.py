@@ -36,6 +36,9 @@ class _Fmi1File(FmuFile):
         """True: the calls are not those that the C loops know."""
         return True
 
+    def _logged(self) -> bytes:
+        return _YES if self._logs else _NO
+
     def _bind(self, where: str) -> None:
         identifier = str(self.about.interface.modelIdentifier)
 
@@ -70,7 +73,7 @@ class Fmi1File(_Fmi1File):
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
         component: int | None = self._functions["fmi1InstantiateSlave"](
             *(name.encode(), self.token.encode(), self._resources),
-            *(b"application/x-fmu-sharedlibrary", _TIMEOUT, _NO, _NO, callbacks, _NO),
+            *(b"application/x-fmu-sharedlibrary", _TIMEOUT, _NO, _NO, callbacks, self._logged()),
         )
         return component
 
@@ -94,7 +97,7 @@ class Fmi1SteppedFile(_Fmi1File, SteppedFile):
 
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
         component: int | None = self._functions["fmi1InstantiateModel"](
-            name.encode(), self.token.encode(), callbacks, _NO
+            name.encode(), self.token.encode(), callbacks, self._logged()
         )
         return component
 

@@ -45,7 +45,7 @@ class ModelExchangeFile(FmuFile):
 
     def _instantiate(self, name: str, key: int, callbacks: Any) -> int | None:
         text, token = name.encode(), self.token.encode()
-        quiet = (False, False)  # neither visible nor debug logging
+        quiet = (False, self._logs)  # not visible
         if self.version == 2:
             arguments: tuple[Any, ...] = (text, 0, token, self._resources)
             arguments += (ctypes.byref(callbacks), *quiet)

@@ -336,13 +336,13 @@ API fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String gui
                                   fmi2String resources, const fmi2CallbackFunctions *functions,
                                   fmi2Boolean visible, fmi2Boolean logging)
 {
-    (void)type, (void)resources, (void)visible, (void)logging;
+    (void)type, (void)resources, (void)visible;
     Instance *i = made(2, name, guid);
-    if (!i) {
+    if (!i && logging) /* many say why only if they are asked to */
         functions->logger(functions->componentEnvironment, name, fmi2Error, "error",
                           "this GUID is not mine");
+    if (!i)
         return NULL;
-    }
     i->log2 = functions->logger;
     i->environment = functions->componentEnvironment;
     at(i, "Instantiate");
@@ -459,9 +459,11 @@ API fmi3Instance fmi3InstantiateCoSimulation(
     fmi3Boolean logging, fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference *required,
     size_t n, fmi3InstanceEnvironment environment, fmi3LogMessageCallback *log, void *update)
 {
-    (void)resources, (void)visible, (void)logging, (void)events, (void)early;
+    (void)resources, (void)visible, (void)events, (void)early;
     (void)required, (void)n, (void)update;
     Instance *i = made(3, name, token);
+    if (!i && logging)
+        log(environment, fmi3Error, "error", "this token is not mine");
     if (!i)
         return NULL;
     i->log3 = log;
