@@ -35,7 +35,7 @@ typedef struct {
 enum {
     NOTHING, SEGFAULT, ABORT, EXIT, HANG, ERROR, FATAL, DISCARD, OUTSIDE, NOT_A_NUMBER, STACK,
     MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES,
-    CHANGES, OPENS, FILLS, DAEMON, SLOW
+    CHANGES, OPENS, FILLS, DAEMON, SLOW, STRANGER
 };
 
 static int instances;
@@ -122,6 +122,10 @@ static int go_wrong(Plant *p)
         for (int k = 0; k < 200000; k++)
             p->callbacks->logger(p->callbacks->environment, p->name, 1, NULL, "%s %d",
                                  "many \xff words", k);
+        break;
+    case STRANGER:
+        p->callbacks->logger((void *)1, p->name, 1, NULL, "from nobody");
+        p->callbacks->logger(NULL, p->name, 1, NULL, "from nobody");
         break;
     case OUTPUT:
         for (;;)

@@ -22,7 +22,7 @@ from posmas_fmi.protocol import make_protocol
 FAULTS = (
     *("nothing", "segfault", "abort", "exit", "hang", "error", "fatal", "discard", "outside"),
     *("not a number", "stack", "memory", "logs", "output", "closes", "once", "exit reading"),
-    *("free crashes", "terminates", "changes", "opens", "fills", "daemon", "slow"),
+    *("free crashes", "terminates", "changes", "opens", "fills", "daemon", "slow", "stranger"),
 )
 
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>

@@ -259,6 +259,16 @@ def test_log_floods_and_closed_descriptors(fmu: Path, caplog: pytest.LogCaptureF
     assert outcome.ended in ("complete", "failed")  # it is over before the worker sees it, or not
 
 
+@pytest.mark.parametrize("apart", ["process", "none"])
+@pytest.mark.parametrize("n", [1, 3])
+def test_messages_that_do_not_say_from_whom(fmu: Path, apart: Any, n: int) -> None:
+    """A public water tank gives 1 for what it was given; `check` knows the others."""
+    faults = {0: values("stranger", at=0.2)}
+    with faulty_plant(fmu, faults, attrs.evolve(isolation(), mode=apart), n=n) as plant:
+        outcome = engine.run(faulty_system(n), plant)
+    assert outcome.ended == "complete", outcome.reason
+
+
 def test_what_an_fmu_changes_in_its_process_is_put_back(fmu: Path) -> None:
     """Rounding would change the numbers of the others, the folder the files that they open."""
     _, healthy = run(fmu, {}, isolation())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import weakref
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 from typing import Protocol as Interface
@@ -187,7 +188,7 @@ class MessageLog(ctypes.Structure):
 
 
 class _Sender(ctypes.Structure):
-    _fields_ = (("log", _pointer), ("key", _int))
+    _fields_ = (("log", _pointer), ("key", _int), ("next", _pointer))
 
 
 class NativeMessages:
@@ -205,6 +206,10 @@ class NativeMessages:
         self._library = library
         self._log = MessageLog() if log is None else log
         self._senders: dict[int, _Sender] = {}
+        for name in ("message_log_enter", "message_log_leave"):
+            getattr(library, name).argtypes = [_pointer]
+            getattr(library, name).restype = None
+        weakref.finalize(self, _leave, library, self._senders)
         self._begin: dict[int, int] = {}
 
     @property
@@ -219,8 +224,10 @@ class NativeMessages:
 
     def environment(self, key: int) -> int:
         """Return what the instance gives to that function."""
-        sender = self._senders.setdefault(key, _Sender(self.address, key))
-        return ctypes.addressof(sender)
+        if key not in self._senders:
+            sender = self._senders[key] = _Sender(self.address, key)
+            self._library.message_log_enter(ctypes.addressof(sender))
+        return ctypes.addressof(self._senders[key])
 
     def add(self, key: int, text: str) -> None:
         """Keep what was found out about an instance, as if it had said it."""
@@ -241,6 +248,11 @@ class NativeMessages:
         written = self._log.written
         kept = (self._log.message[k % _KEPT] for k in range(max(begin, written - _KEPT), written))
         return [m.text.decode("utf-8", "replace") for m in kept if m.sender == key]
+
+
+def _leave(library: ctypes.CDLL, senders: dict[int, _Sender]) -> None:
+    for sender in senders.values():
+        library.message_log_leave(ctypes.addressof(sender))
 
 
 # ---- the instances -------------------------------------------------------------------------------

@@ -19,9 +19,10 @@ typedef struct {
 } MessageLog;
 
 /* What an instance is given as its environment. */
-typedef struct {
+typedef struct Sender {
     MessageLog *log;
     int64_t key;
+    struct Sender *next; /* of those that are known */
 } Sender;
 
 #endif
