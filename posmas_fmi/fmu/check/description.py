@@ -354,12 +354,13 @@ def _structure(told: Description) -> Iterator[Finding]:
         yield Finding("warning", "structure-missing", _PLACE, "expected a ModelStructure")
         return
     if told.major == 3:
-        listed = {v.name for v in told.variables if v.reference in told.outputs}
+        named = set(told.outputs)  # there may be hundred thousands
+        listed = {v.name for v in told.variables if v.reference in named}
         known = {v.reference for v in told.variables}
         wrong = [text for text in told.outputs if text not in known]
     else:
         places = [int(text) if text.isascii() and text.isdigit() else 0 for text in told.outputs]
-        good = [k for k in places if 1 <= k <= len(told.variables)]
+        good = {k for k in places if 1 <= k <= len(told.variables)}
         wrong = [t for t, k in zip(told.outputs, places, strict=True) if k not in good]
         listed = {told.variables[k - 1].name for k in good}
     yield from _about(
