@@ -510,6 +510,8 @@ LIFE = [
     _late("DoStep hang 9", "the 9th step does not come back", "hang", "DoStep", bounds=HANG),
     Defect("DoStep spin", "a step computes for ever", "fatal", "hang", "DoStep", bounds=HANG),
     Defect("DoStep stop", "a step stops its process", "fatal", "hang", "DoStep", bounds=HANG),
+    _late("DoStep slow", "each step takes 0.4 s, together more than the trial may", "too-slow", "",
+          bounds=attrs.evolve(BOUNDS, whole=3.0)),
     Defect("Instantiate null", "it returns no instance", "fatal", "no-instance", "Instantiate"),
     _late("Instantiate same", "it returns the same instance twice", "instances-share", ""),
     _late("DoStep shared", "instances share a variable", "instances-share", "DoStep"),

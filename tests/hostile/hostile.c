@@ -131,6 +131,8 @@ static int perform(Instance *i)
     if (!strcmp(how, "hang"))
         for (;;)
             sleep(1);
+    if (!strcmp(how, "slow"))
+        usleep(400000);
     if (!strcmp(how, "spin"))
         for (;;)
             zero = 0;
