@@ -141,6 +141,8 @@ def _run(arguments: argparse.Namespace) -> int:
             print(f"           that does not cover {', '.join(uncovered)}")
         print(f"error      {_number(summary['tracking_error_final'])} to the leader at the end")
         print(f"min state  {_number(summary['min_state'])}")
+        if summary.get("replay_noise") is not None:
+            print(f"replay     steps done again differ by {_number(summary['replay_noise'])}")
         print(f"report     {folder / 'report.html'}")
     if summary["verdict"] == "failed":
         return 3

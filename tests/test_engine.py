@@ -472,6 +472,19 @@ def test_nothing_is_read_between_an_input_and_the_step(
     assert outcome.ended == "complete", outcome.reason
 
 
+@pytest.mark.parametrize("reached", ["NAN", "-1.0", "1.5 * communicationStepSize"])
+@pytest.mark.parametrize("which", ["c", "numpy"])
+def test_an_early_return_at_no_time_of_the_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, which: str, reached: str
+) -> None:
+    """Beyond the end of the step, say, is another time than that of all others."""
+    odd = EARLY.split("        return")[0].replace("0.4 * communicationStepSize", reached)
+    changed(monkeypatch, 3, STEP, f"{odd}        return fmi3OK;\n    }}\n{STEP}")
+    outcome, _ = run(Fragile(), tmp_path, which)
+    assert outcome.ended == "failed"
+    assert "expected times within the step" in outcome.reason
+
+
 def test_an_fmu_that_gives_no_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     call = "first.environment = functions->componentEnvironment;"
     why = (

@@ -157,6 +157,36 @@ def test_a_tick_between_points_of_an_fmu_with_equal_steps(clocked: Path, tmp_pat
             instance.do_step(0.3, 0.15)
 
 
+@pytest.mark.parametrize("reached", ["NAN", "t - 1", "t + 2 * h", "t"])
+def test_an_early_return_at_no_time_of_the_step(tmp_path: Path, reached: str) -> None:
+    """In a scenario, so that the failure can be written down as well."""
+    code = (CLOCKED / "model.c").read_text()
+    old = "*reached = *early ? s->event_at : end;"
+    path = packed(tmp_path, code.replace(old, f"*early = true, *reached = {reached};"))
+    file = one_fmu(tmp_path, path, '"u"', '"y"', 'isolation = "none"')
+    summary = run(load(file), tmp_path / "out", report=False).summary
+    assert summary["verdict"] == "failed"
+    assert "fmi3DoStep: returned early at" in summary["reason"]
+
+
+@pytest.mark.parametrize("most", [0.03, 0.013])
+def test_a_step_that_returns_early_each_time(clocked: Path, tmp_path: Path, most: float) -> None:
+    code = (CLOCKED / "model.c").read_text()
+    old = "const double end = t + h;"
+    code = code.replace(old, f"const double whole = t + h, end = t + fmin(h, {most});")
+    code = code.replace("*early = *event && s->early", "*early = end < whole || *event && s->early")
+    code = code.replace("*early ? s->event_at : end", "*event ? fmin(s->event_at, end) : end")
+    found = []
+    for path in (clocked, packed(tmp_path, code)):
+        with open_fmu(path) as file, file.instantiate("s") as instance:
+            instance.initialise({"gain": 2.0}, stop=10.0)
+            for k in range(10):
+                instance.write(file.ports(("u",)), [k + 1.0])
+                instance.do_step(0.1 * k, 0.1)
+            found.append([instance.get(name) for name in ("y", "x", "jumps", "alarms")])
+    assert found[1] == pytest.approx(found[0], rel=1e-12)
+
+
 def test_without_event_mode_it_is_refused(clocked: Path, tmp_path: Path) -> None:
     with pytest.raises(FmuError, match="hasEventMode"):
         EventFile(described(clocked, tmp_path / "x.fmu", b'hasEventMode="true"', b""))
@@ -282,6 +312,28 @@ def test_a_run_with_them_goes_on_from_a_snapshot(
         with xarray.open_dataset(tmp_path / f"from-{begin}" / "results.nc") as data:
             for name in ("time", "y", "u", "xhat"):
                 np.testing.assert_array_equal(data[name].values, expected[name].values[begin:])
+
+
+def test_events_of_a_model_on_and_between_the_points(tmp_path: Path) -> None:
+    """x' = 1 + u falls from 1 to 0, which falls between the points; the clock ticks on them."""
+    folder = Path(__file__).parent / "sawtooth"
+    path = packed(tmp_path, (folder / "model.c").read_text(), folder)
+    with open_fmu(path) as file, file.instantiate("s") as instance:
+        assert isinstance(instance, SteppedInstance)
+        instance.initialise({}, stop=3.0)
+        for k in range(30):  # 0.1·k is above 0.5, 1, … by rounding at times, at times below
+            instance.write(file.ports(("u",)), [0.27])
+            instance.do_step(0.1 * k, 0.1)
+            t = (k + 1) / 10
+            assert instance.get("clock") == t // 0.5, t
+            way = 1.27 * t
+            assert instance.get("falls") == way // 1, t
+            assert instance.get("x") == pytest.approx(way - way // 1, abs=1e-7)
+    with open_fmu(path) as file, file.instantiate("s") as instance:
+        instance.initialise({}, stop=3.0)
+        instance.write(file.ports(("u",)), [0.2])
+        instance.do_step(0.0, 3.0)  # many events in one step, and one at its end
+        assert [instance.get(name) for name in ("clock", "falls")] == [6.0, 3.0]
 
 
 def test_what_is_scheduled_only_is_not_run(tmp_path: Path) -> None:

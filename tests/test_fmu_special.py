@@ -60,6 +60,44 @@ def test_structural_parameters_in_a_scenario(sized: Path, tmp_path: Path) -> Non
         run(load(without), tmp_path / "out2", report=False)
 
 
+def test_what_is_no_start_value_for_an_array(sized: Path, tmp_path: Path) -> None:
+    """Each with its place, and before anything runs."""
+    two = "[[plant.override]]\nagent = 2\nparameters = "
+    for more, told in (
+        ("parameters = {gain = [[1, 2], [3]]}", r"parameters: expected rows of the same length"),
+        ("parameters = {m = -1}", r"plant.parameters: clocked.fmu: expected a whole number >= 0"),
+        (f"{two}{{m = 4}}", r"override\[0\].parameters: .* parameter 'm' to be the same for all"),
+        (f"{two}{{m = 4, gain = [1, 2, 3, 4]}}", "use a copy of the file"),
+        (f"parameters = {{gain = [1, 2]}}\n{two}{{gain = [1]}}", r"array of shape \(2,\)"),
+    ):
+        with pytest.raises(InputError, match=told):
+            run(load(one_fmu(tmp_path, sized, '"u[1]"', '"y[1]"', more)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_inputs_of_the_protocol_at_one_of_the_fmu(sized: Path, tmp_path: Path) -> None:
+    text = Path(one_fmu(tmp_path, sized, '"u[1]"', '"y[1]"'))
+    text.write_text(
+        text.read_text()
+        .replace("B = [[0.1]]", "B = [[0.1, 0.1]]")
+        .replace("K = [[0.0]]", "K = [[0.0], [0.0]]")
+        .replace('{u1 = "u[1]"}', '{u1 = "u[1]", u2 = "u[1]"}')
+    )
+    with pytest.raises(InputError, match=r"inputs.u2: 'u\[1\]' is set by u1 already"):
+        run(load(text), tmp_path / "out")
+
+
+def test_variables_are_recorded_under_names_that_are_free(sized: Path, tmp_path: Path) -> None:
+    """The FMU has a u, a y and a time of its own, and so has the result."""
+    slashed = described(sized, tmp_path / "sized.fmu", b'name="gain"', b'name="a/gain"')
+    more = 'record = ["time", "u[2]", "m", "a/gain[1]"]\nparameters = {"a/gain" = [2, 3]}'
+    path = one_fmu(tmp_path, slashed, '"u[1]"', '"y[1]"', more, gain=-0.4)
+    run(load(path), tmp_path / "out")  # with its report
+    with xarray.open_dataset(tmp_path / "out" / "results.nc") as data:
+        assert {"agents.time", "u[2]", "m", "a|gain[1]"} < set(data)
+        assert (data["a|gain[1]"] == 2.0).all()
+
+
 def test_instances_of_one_file_have_the_same_structure(sized: Path) -> None:
     ports = PortMap.plain(("u[1]",)), PortMap.plain(("y[1]",))
     specs = [PlantSpec(sized, {"m": m}, f"number {m}", *ports) for m in (3, 4)]

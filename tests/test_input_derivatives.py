@@ -12,6 +12,7 @@ import pytest
 import xarray
 
 from posmas_fmi import load, run
+from posmas_fmi.cli import main
 from posmas_fmi.fmu.compile import host, shared_library
 from posmas_fmi.scenario.schedule import schedule_of
 
@@ -166,6 +167,21 @@ def test_connections_are_of_second_order(ramp: Path, coupling: str, which: str, 
         found = float(data["y"][-1, 0, 0]), float(data["other.x"][-1])
         errors.append(max(abs(a - b) for a, b in zip(found, exact, strict=True)))
     assert (orders(errors) > order - 0.2).all(), errors
+
+
+def test_the_replay_noise_is_told_in_the_report_and_at_the_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = (RAMP / "model.c").read_text()
+    noisy = "    static int n;\n    *r = *state;\n    r->v[X] += (n++ % 3) * 1e-6;"
+    folder = made(tmp_path, code.replace("    *r = *state;", noisy))
+    results(folder, "noisy", coupling="iterate", more=PAIR)
+    scenario, out = str(folder / "noisy.toml"), str(folder / "out")
+    assert main(["run", scenario, "--out", out]) == 0
+    noise = json.loads((folder / "out" / "summary.json").read_text())["replay_noise"]
+    assert 1e-7 < noise < 1e-5
+    assert f"replay     steps done again differ by {noise:.4g}" in capsys.readouterr().out
+    assert f"differed by {noise:.3g}" in (folder / "out" / "report.html").read_text()
 
 
 def test_the_schedule_says_so(ramp: Path) -> None:

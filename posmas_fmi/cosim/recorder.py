@@ -29,6 +29,11 @@ FIRST = 64_000_000  # bytes that a file begins with at most
 SPARE = 250_000  # bytes that the file itself may need, beside the rows
 
 
+_FIXED = {"time", "agent", "state", "input", "output", "arc", "arc_from", "arc_to", "arc_weight"}
+_OURS = {"pinning", "x", "xhat", "u", "sec_u", "y", "s", "x_baseline", "extra", "set_point"}
+TAKEN = frozenset(_FIXED | _OURS)  # names that a result has anyhow
+
+
 @attrs.frozen
 class Layout:
     """What the columns of a result are: sizes, names and units.

@@ -76,11 +76,7 @@ class About:
         InputError
             If one is no whole number >= 0.
         """
-        given = {
-            name: value
-            for name, value in values.items()
-            if name in self.variables and self.variables[name].causality == "structuralParameter"
-        }
+        given = {name: value for name, value in values.items() if name in self.structural}
         if not given:
             return self
         for name, value in given.items():
@@ -93,6 +89,11 @@ class About:
         return attrs.evolve(
             self, names=attrs.evolve(self.names, by_name=named), structure=structure
         )
+
+    @property
+    def structural(self) -> frozenset[str]:
+        """Names of the structural parameters."""
+        return self.names.structural
 
     @property
     def variables(self) -> Mapping[str, Variable]:

@@ -15,7 +15,7 @@ from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.clocks import Clock
 from posmas_fmi.fmu.events import settle, update_discrete_states
 from posmas_fmi.fmu.file import FmuFile
-from posmas_fmi.fmu.instance import FmuInstance
+from posmas_fmi.fmu.instance import MOST_STUCK, FmuInstance
 from posmas_fmi.fmu.period import allows_steps_of_different_length
 from posmas_fmi.fmu.variables import REAL, Ports
 
@@ -174,11 +174,15 @@ class EventInstance(FmuInstance):
         due = self._due(time + same)
         if due or self._to_set(due):
             self._event(time, due)
-        now = time
+        now, stuck = time, 0
         for _ in range(_MOST_EVENTS):
             until = min((self.next_event, *self._tick_at.values())) if self._varies else end
             until = until if now + same < until < end - same else end
             done = self.step_once(now, until - now)
+            moved = not done.early or done.reached > now
+            stuck = 0 if moved or done.event else stuck + 1
+            if stuck > MOST_STUCK:
+                raise self.ended_early(False, now)
             now = done.reached if done.early else until
             self.time = now
             ends = now >= end - same

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _MOST_RETURNS = 100_000  # before the end of one step
-_MOST_STUCK = 100  # of them at the same time
+MOST_STUCK = 100  # of them at the same time
 _SAME = 1e-9  # of a step: times that are the same
 _DISCARD, _PENDING = 2, 5
 _LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3  # fmi2StatusKind
@@ -176,7 +176,10 @@ class FmuInstance:
         """Return the error for a step that did not get to its end."""
         if terminates:
             return self.ended("DoStep", reached)
-        return self.error("DoStep", f"returned early at {reached!r} s")
+        return self.error(
+            "DoStep",
+            f"returned early at {reached!r} s: expected times within the step, then its end",
+        )
 
     def ended(self, function: str, reached: float) -> FmuEndedError:
         """Return what is told when the FMU asks to end the simulation, which is no failure."""
@@ -263,7 +266,7 @@ class FmuInstance:
                 self.time = end
                 return
             stuck = 0 if done.reached > now else stuck + 1
-            if stuck > _MOST_STUCK:
+            if stuck > MOST_STUCK:
                 raise self.error("DoStep", f"returned early {stuck} times at {now!r} s")
             now, length = done.reached, end - done.reached
         raise self.error("DoStep", f"returned early {_MOST_RETURNS} times, at last at {now!r} s")
@@ -274,7 +277,7 @@ class FmuInstance:
         Raises
         ------
         FmuCallError
-            Also if the FMU asks to end the simulation.
+            Also if the FMU asks to end the simulation, or returns at a time outside the step.
         """
         if self.file.version == 2:
             try:
@@ -288,8 +291,11 @@ class FmuInstance:
         last = ctypes.c_double(time)
         by = ctypes.byref
         self.call("DoStep", time, step, False, by(event), by(terminate), by(early), by(last))
+        inside = time <= last.value <= time + step * (1 + _SAME)  # not of NaN
         if terminate.value:
-            raise self.ended_early(True, last.value)
+            raise self.ended_early(True, last.value if inside else time)
+        if early.value and not inside:
+            raise self.ended_early(False, last.value)
         return Step(last.value if early.value else time + step, early.value, event.value)
 
     def _asks_to_end(self) -> bool:
@@ -304,7 +310,7 @@ class FmuInstance:
         reached = ctypes.c_double(time)
         with suppress(FmuError):
             self.call("GetRealStatus", _LAST_SUCCESSFUL_TIME, ctypes.byref(reached))
-        return reached.value
+        return reached.value if math.isfinite(reached.value) else time
 
     def terminate(self) -> None:
         """End the simulation; values may still be read."""

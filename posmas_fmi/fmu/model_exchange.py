@@ -181,7 +181,10 @@ class ModelExchangeInstance(FmuInstance):
     # ---- the way through time -------------------------------------------------------------------
 
     def advance(self, until: float, rtol: float = 1e-9) -> None:
-        """Integrate to a later time with the inputs as they are; events are handled on the way.
+        """Integrate to a later time with the inputs as they are.
+
+        Events on the way are handled, and those at its end, so what is read there is what comes
+        after them.
 
         Parameters
         ----------
@@ -196,10 +199,14 @@ class ModelExchangeInstance(FmuInstance):
             Also if the integration fails, or events crowd.
         """
         for _ in range(_MOST_EVENTS):
-            if self.time >= until:
+            here = self.time + _EVENT_WIDTH * max(abs(self.time), 1.0)  # is the same time
+            if self.next_event <= here:
+                if self.time < self.next_event:  # by rounding; the FMU looks at the time itself
+                    self.set_time(self.next_event)
+                self.handle_event()
+            elif until <= here:  # LSODA takes no step of a few units in the last place
                 return
-            due = self.next_event <= self.time * (1 + _EVENT_WIDTH)
-            if due or self._integrate(min(until, self.next_event), rtol):
+            elif self._integrate(min(until, self.next_event), rtol):
                 self.handle_event()
         raise self.error("DoStep", f"more than {_MOST_EVENTS} events before {until:g} s")
 

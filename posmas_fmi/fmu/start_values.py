@@ -53,7 +53,7 @@ def spread(about: About, values: Mapping[str, Any]) -> dict[str, Any]:
     """
     spreads: dict[str, Any] = {}
     for name, value in values.items():
-        if isinstance(value, str) or name in about.variables or np.ndim(value) == 0:
+        if isinstance(value, str) or name in about.variables or not shape_of(name, value):
             spreads[name] = value
             continue
         array = np.asarray(value, dtype=float)
@@ -65,6 +65,14 @@ def spread(about: About, values: Mapping[str, Any]) -> dict[str, Any]:
         if problem:
             raise InputError(f"{about.path.name}: {problem}")
     return spreads
+
+
+def shape_of(name: str, value: Any) -> tuple[int, ...]:
+    """Return the shape of a value; lists of different lengths in it are an InputError."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        raise InputError(f"expected rows of the same length for {name!r} (got {value!r})") from None
 
 
 def _misfit(about: About, name: str, value: Any) -> str:

@@ -233,6 +233,13 @@ class Variables:
     where: str
 
     @cached_property
+    def structural(self) -> frozenset[str]:
+        """Names of the structural parameters."""
+        return frozenset(
+            name for name, one in self.by_name.items() if one.causality == "structuralParameter"
+        )
+
+    @cached_property
     def _elements(self) -> dict[str, tuple[Variable, int]]:
         return dict(self._named_elements())
 

@@ -201,6 +201,18 @@ def _traffic(keys: _Keys) -> tuple[str, ...]:
     return (f"{sent:.0f} messages between agents{share}",)
 
 
+def _replay(keys: _Keys) -> tuple[str, ...]:
+    noise = keys.number("replay_noise")
+    if noise is None:
+        return ()
+    if noise == 0:
+        return ("a step that was done again came to the same, bit for bit",)
+    return (
+        f"a step that was done again differed by {noise:.3g}, relative: replay noise, twice which "
+        "is in the tolerance of the coupling",
+    )
+
+
 def summary_facts(content: dict[str, Any], path: Path) -> Summary:
     """Return what ``summary.json`` says; InputError names the key that is not as agreed."""
     keys = _Keys(content, path)
@@ -223,7 +235,7 @@ def summary_facts(content: dict[str, Any], path: Path) -> Summary:
         wall_s=keys.number("wall_s"),
         steps=None if steps is None or math.isinf(steps) else int(steps),
         comparison=keys.mapping("comparison"),
-        notes=(*keys.texts("messages"), *_traffic(keys)),
+        notes=(*keys.texts("messages"), *_traffic(keys), *_replay(keys)),
         band=keys.number("band_K") if "band_K" in content else None,
         coverage=tuple(
             Used(row.text("what"), row.flag("covered"), row.text("why", ""))

@@ -19,7 +19,7 @@ from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
-from posmas_fmi.fmu.start_values import spread
+from posmas_fmi.fmu.start_values import shape_of, spread
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.faults import make_crashes
 from posmas_fmi.scenario.tables import Override, Port
@@ -135,10 +135,24 @@ def make_instances(
     values = [_values(scenario, k) for k in range(N)]
     values += [table.parameters for table in scenario.components]
     abouts: dict[Path, About] = {}
-    for path, given in zip(files, values, strict=True):
-        if path not in abouts:  # structural parameters are the same for all instances of a file
-            abouts[path] = read_about(path).structured(given)
-            abouts[path].require_interface()
+    first: dict[Path, int] = {}
+    for k, (path, given) in enumerate(zip(files, values, strict=True)):
+        if path not in abouts:
+            about = read_about(path)
+            about.require_interface()
+            for name in sorted(about.structural & set(given)):
+                try:
+                    about = about.structured({name: given[name]})
+                except InputError as error:
+                    raise InputError(error.message, _place(scenario, k, name)) from None
+            abouts[path], first[path] = about, k
+        for name in abouts[path].structural if first[path] != k else ():
+            if given.get(name) != values[first[path]].get(name):
+                raise InputError(
+                    f"{path.name}: expected the structural parameter {name!r} to be the same for "
+                    "all instances of a file; use a copy of the file for those that are different",
+                    _place(scenario, k if name in given else first[path], name),
+                )
     every = _periods(scenario)
     _check_periods(scenario, [abouts[path] for path in files], every)
     shows_states = _shows_states(scenario)
@@ -289,14 +303,16 @@ def _check_values(scenario: Scenario, instances: Sequence[Instance]) -> None:
     """Refuse start values that an FMU does not have, or of another type or shape."""
     known = set()
     for k, one in enumerate(instances):
-        told = [(name, type(value), np.shape(value)) for name, value in one.values.items()]
-        if (key := (one.about.path, *told)) not in known:
-            known.add(key)
+        name, told = "", []
+        try:
             for name, value in one.values.items():
-                try:
+                told.append((name, type(value), shape_of(name, value)))
+            if (key := (one.about.path, *told)) not in known:
+                known.add(key)
+                for name, value in one.values.items():
                     spread(one.about, {name: value})
-                except InputError as error:
-                    raise InputError(error.message, _place(scenario, k, name)) from None
+        except InputError as error:
+            raise InputError(error.message, _place(scenario, k, name)) from None
 
 
 def _place(scenario: Scenario, k: int, name: str) -> str:
@@ -344,6 +360,12 @@ def _ports(
     if problems:
         raise ScenarioError(tuple(problems), str(scenario.path))
     ports = [table[name] for name in names]
+    variables = [port.variable if isinstance(port, Port) else port for port in ports]
+    if kind == "inputs" and len(set(variables)) < len(variables):
+        k = next(k for k, name in enumerate(variables) if name in variables[:k])
+        by = names[variables.index(variables[k])]
+        text = f"{variables[k]!r} is set by {by} already; an input is set by one thing"
+        raise ScenarioError(((f"{place}.{names[k]}", text),), str(scenario.path))
     whole = [port if isinstance(port, Port) else Port(port) for port in ports]
     zero = [n for n, port in zip(names, whole, strict=True) if port.scale == 0]
     if zero:

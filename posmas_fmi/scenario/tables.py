@@ -226,7 +226,8 @@ class PlantTable:
         What the controllers measure beside y, ``name = "signal"``, ``"VARIABLE"`` of the agent's
         FMU or ``"component.VARIABLE"``; which names there are, the control law says.
     record : list of str
-        FMU variables that are recorded in ``results.nc`` besides.
+        FMU variables that are recorded in ``results.nc`` besides; one whose name a result has
+        itself, as x, is ``agents.x`` there.
     tolerance : float, optional
         Relative, for the solver inside the FMU.
     isolation : {"auto", "process", "none"}

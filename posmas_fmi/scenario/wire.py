@@ -9,6 +9,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.cosim.fmu_plant import PlantSpec, PortMap, converted
+from posmas_fmi.cosim.recorder import TAKEN
 from posmas_fmi.cosim.wiring import Extra, NoDrive, Term, Wiring, column
 from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.expression import Array
@@ -111,7 +112,7 @@ class Recorded:
     Attributes
     ----------
     of_agents : dict of str to tuple of int
-        Column of each agent, by variable.
+        Column of each agent, by variable; ``agents.x`` where a result has an x of its own.
     of_components : dict of str to int
         Column by ``component.variable``.
     """
@@ -127,6 +128,11 @@ class Recorded:
             return rest
         agents = {name: extra[:, list(at)] for name, at in self.of_agents.items()}
         return rest | agents | {name: extra[:, at] for name, at in self.of_components.items()}
+
+
+def _label(name: str) -> str:
+    """Return a name that NetCDF takes: there a slash is a folder."""
+    return name.replace("/", "|")
 
 
 def _placed(make: Callable[[], Conversion], place: str) -> Conversion:
@@ -393,9 +399,12 @@ class Wires:
             tuple(place(reading) for reading in recorded),
             NoDrive() if signals is None else signals,
         )
-        of_agents = {name: tuple(range(k * n, (k + 1) * n)) for k, name in enumerate(record)}
+        of_agents = {
+            _label(f"agents.{name}" if name in TAKEN else name): tuple(range(k * n, (k + 1) * n))
+            for k, name in enumerate(record)
+        }
         of_components = {
-            f"{self._all[r.instance].name}.{r.variable}": len(wanted) + k
+            _label(f"{self._all[r.instance].name}.{r.variable}"): len(wanted) + k
             for k, r in enumerate(of_component)
         }
         return wiring, Recorded(of_agents, of_components)

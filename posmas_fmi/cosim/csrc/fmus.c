@@ -149,9 +149,11 @@ int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double 
                                        &early, &reached);
         if (status != OK && !odd(status, CALL_STEP, instance, before, report))
             return 0;
-        if (terminate || (early && returns == MOST_RETURNS)) {
+        const int inside = reached >= begin_at && reached <= t + h + SAME * h; /* not of NaN */
+        if (terminate || (early && (!inside || returns == MOST_RETURNS))) {
             const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
-            return fail(report, (Incident){.call = call, .instance = instance, .value = reached});
+            const double value = terminate && !inside ? begin_at : reached;
+            return fail(report, (Incident){.call = call, .instance = instance, .value = value});
         }
         if (!early || reached >= t + h - SAME * h)
             return 1;
