@@ -134,7 +134,8 @@ def read_netcdf(
     try:
         if not path.is_file():
             raise InputError("expected a NetCDF-4 file (there is none)", where)
-        size = path.stat().st_size
+        with path.open("rb"):  # HDF5 tells at length that it may not
+            size = path.stat().st_size
         wanted = None if names is None else tuple(names)
         deadline = DEADLINE + size / SPEED
         arguments = (str(path), wanted, largest, limit)

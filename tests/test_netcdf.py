@@ -71,6 +71,16 @@ def test_a_hang_is_told_as_one(hanging: Path, monkeypatch: pytest.MonkeyPatch) -
             read(hanging)
 
 
+def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(self: Path, *given: object, **named: object) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    (tmp_path / "a.nc").touch()
+    monkeypatch.setattr(Path, "open", refused)  # root may read everything
+    with pytest.raises(InputError, match=r"expected a NetCDF-4 file \(Permission denied\)"):
+        read_netcdf(tmp_path / "a.nc")
+
+
 def test_a_run_does_not_go_on_with_damaged_results(tmp_path: Path) -> None:
     """It began anew and replaced them."""
     scenario, out = made(tmp_path), tmp_path / "out"

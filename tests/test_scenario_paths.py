@@ -146,3 +146,14 @@ def test_the_command_tells_what_the_proof_does_not_cover(
     path = scenario(tmp_path, '[control]\npython = "mine.py:Mine"\n')
     main(["run", path, "--until", "0.1", "--out", str(tmp_path / "out")])
     assert "that does not cover controllers of one's own" in capsys.readouterr().out
+
+
+def test_an_fmu_that_cannot_be_read_is_a_mistake_of_the_scenario(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As for `check`; it was a failure of the FMU, without its place."""
+    empty = tmp_path / "empty.fmu"
+    empty.touch()
+    path = one_fmu(tmp_path, empty, '"power"', '"temperature"')
+    assert main(["run", path, "--out", str(tmp_path / "out")]) == 2
+    assert "$.plant.fmu: empty.fmu: expected an FMU (the file is empty" in capsys.readouterr().err

@@ -16,6 +16,7 @@ from posmas_fmi.cosim.worker.process import Patience
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.about import About, read_about
+from posmas_fmi.fmu.archive import require_file
 from posmas_fmi.fmu.build import agent_fmu, fmu
 from posmas_fmi.fmu.period import check_period
 from posmas_fmi.fmu.plant import read_plant, shipped_plants
@@ -62,6 +63,10 @@ def _locate(scenario: Scenario, name: str, fmi: int, place: str) -> Path:
             ),
             str(scenario.path),
         )
+    try:
+        require_file(path)
+    except InputError as error:
+        raise ScenarioError(((place, f"{name}: {error.message}"),), str(scenario.path)) from None
     return path
 
 
