@@ -52,6 +52,7 @@ def unpack(fmu: Path, folder: Path) -> None:
     try:
         with zipfile.ZipFile(fmu) as archive:
             for entry in archive.infolist():
+                entry.filename = _name(entry)
                 archive.extract(entry, folder)
     except _UNREADABLE as error:
         raise ArchiveError(f"expected a zip archive that can be read ({error})", where) from error
@@ -102,8 +103,8 @@ def examine(fmu: Path, whole: bool = False) -> list[Finding]:
             if any(f.severity == "fatal" for f in findings):
                 return findings
             for entry in archive.infolist():
-                if entry.filename in _READ_BY_US:
-                    findings += xml.scan(archive.read(entry), entry.filename)
+                if _name(entry) in _READ_BY_US:
+                    findings += xml.scan(archive.read(entry), _name(entry))
                 elif whole:
                     findings += _damage(archive, entry)
     except _UNREADABLE as error:
@@ -130,16 +131,26 @@ def read_entry(fmu: Path, name: str, most: int | None = None) -> bytes:
     ArchiveError
     """
     try:
-        with zipfile.ZipFile(fmu) as archive, archive.open(name) as file:
-            return file.read() if most is None else file.read(most)
-    except (*_UNREADABLE, KeyError) as error:
+        with zipfile.ZipFile(fmu) as archive:
+            found = [entry for entry in archive.infolist() if _name(entry) == name]
+            if not found:
+                raise ArchiveError(f"cannot read {name} (there is none)", str(fmu))
+            with archive.open(found[-1]) as file:
+                return file.read() if most is None else file.read(most)
+    except _UNREADABLE as error:
         raise ArchiveError(f"cannot read {name} ({error})", str(fmu)) from error
 
 
 def entry_names(fmu: Path) -> list[str]:
     """Return the names of the files in an archive that `examine` found readable."""
     with zipfile.ZipFile(fmu) as archive:
-        return [entry.filename for entry in archive.infolist() if not entry.is_dir()]
+        names = [_name(entry) for entry in archive.infolist()]
+    return [name for name in names if not name.endswith("/")]
+
+
+def _name(entry: zipfile.ZipInfo) -> str:
+    """Name of an entry; some exporters on Windows write backslashes."""
+    return entry.filename.replace("\\", "/")
 
 
 # ---- details ------------------------------------------------------------------------------------
@@ -173,7 +184,7 @@ def _entries(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[Finding]:
             "archive-entries", "", f"expected at most {MAX_ENTRIES} files (got {len(entries)})"
         )
         return
-    names = Counter(entry.filename for entry in entries)
+    names = Counter(_name(entry) for entry in entries)
     yield from _description_place(names)
     size = sum(entry.file_size for entry in entries)
     if size > MAX_SIZE:
@@ -192,9 +203,13 @@ def _entries(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[Finding]:
         yield _fatal("archive-overlap", "", "entries share the same bytes: this is a zip bomb")
     for entry in entries:
         yield from _entry(entry)
+    turned = [entry.orig_filename for entry in entries if "\\" in entry.orig_filename]
+    if turned:
+        text = f"{len(turned)} names with backslashes: they are read as if they were slashes"
+        yield Finding("warning", "archive-backslash", repr(turned[0]), text, "export it anew")
     contents: dict[str, set[tuple[int, int]]] = {}
     for entry in entries:
-        contents.setdefault(entry.filename, set()).add((entry.CRC, entry.file_size))
+        contents.setdefault(_name(entry), set()).add((entry.CRC, entry.file_size))
     for name, count in names.items():
         if count == 1 or name == DESCRIPTION or name.endswith("/"):
             continue
@@ -229,8 +244,8 @@ def _description_place(names: Counter[str]) -> Iterator[Finding]:
 
 def _entry(entry: zipfile.ZipInfo) -> Iterator[Finding]:
     name = entry.orig_filename  # zipfile hides backslashes and NUL bytes in filename
-    path = PurePosixPath(entry.filename)
-    if path.is_absolute() or ".." in path.parts or set(name) & {"\\", ":", "\0"}:
+    path = PurePosixPath(_name(entry))
+    if path.is_absolute() or ".." in path.parts or set(name) & {":", "\0"}:
         yield _fatal("archive-path", repr(name), "unsafe path in the archive: it may leave it")
     kind = (entry.external_attr >> 16) & 0o170000
     if kind == 0o120000:
