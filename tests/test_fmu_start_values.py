@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import json
 import logging
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 from fmu_examples import example_1, tank_fmu
@@ -104,13 +106,18 @@ def test_a_run_tells_and_keeps_them(
 ) -> None:
     path = scenario(pump, tmp_path, 'limit = 12.0, area = 3.0, label = "abc"')
     with caplog.at_level(logging.WARNING):
-        run(load(path), tmp_path / "out", report=False)
+        run(attrs.evolve(load(path), baseline=True), tmp_path / "out")
     told = json.loads((tmp_path / "out" / "manifest.json").read_text())["start_values"]
     assert [(t["variable"], t["what"], t["instances"]) for t in told] == [
         ("area", "not set", ["1", "2"]),
         ("limit", "changed", ["1", "2"]),
     ]
-    assert "1 and 1 more: start value 'limit' changed: set to 12, and it is 10" in caplog.text
+    text = "1 and 1 more: start value 'limit' changed: set to 12, and it is 10"
+    assert caplog.text.count(text) == 1  # though the run without control starts them once more
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert any(text in message for message in summary["messages"])
+    page = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+    assert text in page
 
 
 def test_a_name_that_is_not_there_is_a_mistake(pump: Path, tmp_path: Path) -> None:
@@ -156,5 +163,5 @@ def test_a_start_value_that_cannot_be_one_is_refused_before_anything_runs(
     path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more)
     with pytest.raises(InputError) as caught:
         scheduled(load(path))
-    assert caught.value.where == place
+    assert [where for where, _ in caught.value.problems] == [place]
     assert told in str(caught.value)

@@ -69,6 +69,11 @@ WRONG = {
     ),
     "source": (('"agents.kv"', '"agents.kw"'), "$.connection[0].source", "no variable 'kw'"),
     "input": (('"agents.header"', '"agents.heder"'), "$.connection[2].to", "did you mean 'header'"),
+    "no input": (
+        ('to = "agents.header"', 'to = "agents.supply_temperature"'),
+        "$.connection[2].to",
+        "'supply_temperature' cannot be set while it runs, its causality is",
+    ),
     "array": (('"kv[2]", "heat"]', '"kv"]'), "$.component[0].record", "as 'kv[1]'"),
 }
 

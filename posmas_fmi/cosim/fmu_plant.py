@@ -37,7 +37,14 @@ from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.model import element_names
 from posmas_fmi.fmu.open import open_fmu
-from posmas_fmi.fmu.start_values import StartFinding, grouped, read_back, settable, spread
+from posmas_fmi.fmu.start_values import (
+    StartFinding,
+    grouped,
+    read_back,
+    settable,
+    spread,
+    told,
+)
 from posmas_fmi.fmu.units import Conversion
 from posmas_fmi.interrupt import Interrupt
 
@@ -92,6 +99,8 @@ class FmuPlant:
     isolation : Isolation, optional
         Which FMUs run in worker processes, and what happens when one fails. By default all run in
         this process, and a failure is the end of the run.
+    quiet : bool
+        Whether no warning tells which start values an FMU did not take.
 
     Attributes
     ----------
@@ -123,6 +132,7 @@ class FmuPlant:
         shows_states: bool,
         stop: float,
         isolation: Isolation = IN_PROCESS,
+        quiet: bool = False,
     ) -> None:
         self.shows_states = shows_states
         self.names = tuple(spec.name for spec in specs)
@@ -154,7 +164,8 @@ class FmuPlant:
             of_each = [files[spec.fmu] for spec in specs]
             self._instances = _start_all(of_each, specs, stop, findings, stack)
             self.start_values = tuple(findings)
-            _tell(findings)
+            for finding in () if quiet else grouped(findings):
+                log.warning("%s", told(finding))
             self.fmus = Fmus(
                 self._instances,
                 [spec.inputs for spec in specs],
@@ -443,16 +454,6 @@ def _initialise(instance: FmuInstance, spec: PlantSpec, stop: float) -> list[Sta
     values, refused = settable(about, spread(about, spec.values), spec.name)
     instance.initialise(values, stop=stop, tolerance=spec.tolerance)
     return [*refused, *read_back(instance, values)]
-
-
-def _tell(findings: list[StartFinding]) -> None:
-    for one in grouped(findings):
-        who = one["instances"]
-        more = f" and {len(who) - 1} more" if len(who) > 1 else ""
-        log.warning(
-            "%s: %s%s: start value %r %s: %s",
-            *(one["fmu"], who[0], more, one["variable"], one["what"], one["message"]),
-        )
 
 
 def structure_of(path: Path, specs: Sequence[PlantSpec]) -> Mapping[str, int]:

@@ -200,6 +200,23 @@ def _shown(value: Any) -> str:
     return f"[{', '.join(numbers)}{', …' if value.size > 4 else ''}]"
 
 
+def told(finding: Mapping[str, Any]) -> str:
+    """Say one of the findings of `grouped` in words.
+
+    Examples
+    --------
+    >>> one = StartFinding("b", "a.fmu", "m", "not set", "it is a constant")
+    >>> told(grouped([one, one])[0])
+    "a.fmu: b and 1 more: start value 'm' not set: it is a constant"
+    """
+    who = finding["instances"]
+    more = f" and {len(who) - 1} more" if len(who) > 1 else ""
+    return (
+        f"{finding['fmu']}: {who[0]}{more}: start value {finding['variable']!r} "
+        f"{finding['what']}: {finding['message']}"
+    )
+
+
 def grouped(findings: Iterable[StartFinding]) -> list[dict[str, Any]]:
     """Return findings as a manifest shows them: what is the same for many instances stands once.
 

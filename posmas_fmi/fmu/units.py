@@ -124,7 +124,7 @@ class Units:
         posmas_fmi.errors.InputError: L/min (m3.s-1) cannot be converted to kg/s (kg.s-1); ...
         """
         if variable is None:
-            raise InputError(f"the FMU does not say in which unit it is (the port has {port!r})")
+            _refuse(f"the FMU does not say in which unit it is (the port has {port!r})")
         if port == variable:
             return Conversion()
         outer = _parsed(port) or self.defined.get(port)

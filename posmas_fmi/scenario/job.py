@@ -30,6 +30,7 @@ from posmas_fmi.expression import Array
 from posmas_fmi.fmu.about import read_about
 from posmas_fmi.fmu.scratch import sweep
 from posmas_fmi.fmu.start_values import grouped
+from posmas_fmi.fmu.start_values import told as start_value
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
@@ -241,6 +242,8 @@ def _run_in(
         scenario, designed, instances, choice, folder, progress, started, beginning
     )
     summary = summarise(outcome, scenario.network.names, scenario.settings.tolerance, left)
+    if told["start_values"]:
+        summary["messages"] = [start_value(finding) for finding in told["start_values"]]
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
         summary["faults"] = describe(list(scenario.faults), designed.network, scenario.clock)
@@ -335,7 +338,7 @@ def _without_control(
         if thinned.rows < points and "x" in values:
             thinned({"x_baseline": values["x"][: points - thinned.rows]})
 
-    with instances.start() as plant:
+    with instances.start(quiet=True) as plant:
         outcome = engine.run(
             make_system(scenario, uncontrolled, instances),
             plant,

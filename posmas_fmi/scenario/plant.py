@@ -104,8 +104,8 @@ class Instances:
     every: Whole
     isolation: Isolation
 
-    def start(self) -> FmuPlant:
-        """Load and initialise them.
+    def start(self, quiet: bool = False) -> FmuPlant:
+        """Load and initialise them; if quiet, without a warning about start values.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class Instances:
         FmuError
             If one cannot be loaded or initialised.
         """
-        return FmuPlant(self.specs, self.shows_states, self.stop, self.isolation)
+        return FmuPlant(self.specs, self.shows_states, self.stop, self.isolation, quiet)
 
 
 def make_instances(
@@ -228,14 +228,18 @@ def _agent_instance(scenario: Scenario, k: int, about: About, shows_states: bool
     readings = _ports(scenario, "outputs", agent.q, own)
     if shows_states:
         readings = readings + _ports(scenario, "states", agent.m, own)
-    return Instance(
+    inputs = _ports(scenario, "inputs", agent.p, own)
+    made = Instance(
         scenario.network.names[k],
         about,
         _values(scenario, k),
-        _ports(scenario, "inputs", agent.p, own),
+        inputs,
         readings,
         scenario.plant.tolerance,
     )
+    for variable in inputs.variables:
+        made.check_input(variable, inputs.place)
+    return made
 
 
 def _override(scenario: Scenario, k: int) -> tuple[int, Override] | None:
@@ -306,18 +310,24 @@ def _values(scenario: Scenario, k: int) -> dict[str, Any]:
 
 def _check_values(scenario: Scenario, instances: Sequence[Instance]) -> None:
     """Refuse start values that an FMU does not have, or of another type or shape."""
-    known = set()
+    known, problems = set(), []
     for k, one in enumerate(instances):
-        name, told = "", []
-        try:
-            for name, value in one.values.items():
+        told: list[tuple[Any, ...]] = []
+        for name, value in one.values.items():
+            try:
                 told.append((name, type(value), shape_of(name, value)))
-            if (key := (one.about.path, *told)) not in known:
-                known.add(key)
-                for name, value in one.values.items():
-                    spread(one.about, {name: value})
-        except InputError as error:
-            raise InputError(error.message, _place(scenario, k, name)) from None
+            except InputError as error:
+                problems.append((_place(scenario, k, name), error.message))
+        if (key := (one.about.path, *told)) in known:
+            continue
+        known.add(key)
+        for name, *_ in told:
+            try:
+                spread(one.about, {name: one.values[name]})
+            except InputError as error:
+                problems.append((_place(scenario, k, name), error.message))
+    if problems:
+        raise ScenarioError(tuple(dict.fromkeys(problems)), str(scenario.path))
 
 
 def _place(scenario: Scenario, k: int, name: str) -> str:

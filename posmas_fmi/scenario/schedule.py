@@ -51,8 +51,8 @@ class Edge:
         Communication steps between the time at which the source has a value and that from which
         on the input has it.
     feedthrough : bool
-        Whether the source follows inputs of its FMU at once, so that the value is a step older
-        still than the delay says.
+        Whether the source follows inputs of its FMU at once, or may: the value is then a step
+        older still than the delay says.
     ramp : bool
         Whether the input goes on linearly during the step, by its derivative, else it is held.
     """
@@ -77,6 +77,9 @@ class Schedule:
         Beside the network of the agents.
     loops : tuple of tuple of str
         Instances that feed each other in a circle.
+    algebraic : tuple of tuple of str
+        Variables that follow each other at once in a circle: ``instance.variable``, each of which
+        follows the one before it, and the first one the last. One circle for each such group.
     every : dict of str to int
         Instances with a longer period, in communication steps.
     """
@@ -85,6 +88,7 @@ class Schedule:
     actions: tuple[Action, ...]
     edges: tuple[Edge, ...]
     loops: tuple[tuple[str, ...], ...]
+    algebraic: tuple[tuple[str, ...], ...]
     every: dict[str, int]
 
     def to_dict(self) -> dict[str, Any]:
@@ -109,8 +113,11 @@ class Schedule:
                 lines.append(f"  {edge.source} -> {edge.target}: {late}{more}")
             if len(self.edges) > EDGES:
                 lines.append(f"  and {len(self.edges) - EDGES} more (all with --json)")
-        for loop in self.loops:
-            lines.append(f"loop: {' -> '.join((*loop, loop[0]))}")
+        lines += [f"loop: {_few(loop)} act on each other" for loop in self.loops]
+        iterated = any(action.do == "restore" for action in self.actions)
+        how = "solved in every step" if iterated else "broken by what comes a step late"
+        for loop in self.algebraic:
+            lines.append(f"algebraic loop, {how}: {' -> '.join((*loop, loop[0]))}")
         return "\n".join(lines)
 
 
@@ -177,6 +184,7 @@ def make_schedule(scenario: Scenario, instances: Instances, abouts: list[About])
         tuple(actions),
         tuple(_edges(instances, abouts, late, coupling, scenario.signal_columns)),
         _loops(instances),
+        _algebraic(instances, abouts),
         {name: int(n) for name, n in zip(names, instances.every, strict=True) if n > 1},
     )
 
@@ -258,21 +266,38 @@ def _edges(
 
 
 def feeds_through(about: About, variable: str) -> bool:
-    """Whether a variable follows an input of the FMU at once, by its model structure.
+    """Whether a variable follows an input of the FMU at once, or may; see `followed`."""
+    return bool(followed(about, variable))
+
+
+def followed(about: About, variable: str) -> frozenset[str]:
+    """Return the inputs of the FMU that a variable follows at once, by its model structure.
+
+    All of them where that says nothing, as about local variables that are no states.
 
     Parameters
     ----------
     about : About
     variable : str
         Its name, or that of an element.
+
+    Returns
+    -------
+    frozenset of str
+        Names of inputs; of the whole array of an element.
     """
-    whole, _ = about.names.resolve(variable)
-    for unknown in about.description.outputs:
-        if unknown.variable.name == whole.name:
-            if unknown.dependencies is None:
-                return True  # nothing is said: on everything
-            return any(other.causality == "input" for other in unknown.dependencies)
-    return False
+    whole, told = about.variable(variable), about.description
+    if whole.causality == "input":
+        return frozenset({whole.name})
+    if whole.variability in ("constant", "fixed", "tunable"):
+        return frozenset()
+    for unknown in (*told.outputs, *told.derivatives):
+        state = getattr(unknown.variable, "derivative", None)
+        if state is not None and state.name == whole.name:
+            return frozenset()
+        if unknown.variable.name == whole.name and unknown.dependencies is not None:
+            return frozenset(v.name for v in unknown.dependencies if v.causality == "input")
+    return frozenset(v.name for v in about.variables.values() if v.causality == "input")
 
 
 def _loops(instances: Instances) -> tuple[tuple[str, ...], ...]:
@@ -286,6 +311,35 @@ def _loops(instances: Instances) -> tuple[tuple[str, ...], ...]:
     groups = [sorted(group) for group in networkx.strongly_connected_components(graph)]
     loops = [g for g in groups if len(g) > 1 or graph.has_edge(g[0], g[0])]
     return tuple(tuple(names[k] for k in loop) for loop in sorted(loops))
+
+
+def _algebraic(instances: Instances, abouts: list[About]) -> tuple[tuple[str, ...], ...]:
+    """One circle of variables for each group of them that follow each other at once."""
+    import networkx
+
+    names = [spec.name for spec in instances.specs]
+    graph = networkx.DiGraph()
+    fed: dict[int, list[tuple[str, str]]] = {}  # inputs of each instance: whole, element
+    feeds = [feed for feed in _feeds(instances) if feed.source >= 0]
+    for feed in feeds:
+        graph.add_edge((feed.source, feed.variable), (feed.target, feed.to))
+        fed.setdefault(feed.target, []).append(
+            (abouts[feed.target].variable(feed.to).name, feed.to)
+        )
+    for source, variable in {(feed.source, feed.variable) for feed in feeds}:
+        at_once = followed(abouts[source], variable)
+        for whole, element in fed.get(source, ()):
+            if whole in at_once:
+                graph.add_edge((source, element), (source, variable))
+    circles = []
+    for group in networkx.strongly_connected_components(graph):
+        if len(group) > 1:
+            edges = networkx.find_cycle(graph.subgraph(group), min(group))
+            circle = [node for node, _ in edges]
+            first = circle.index(min(circle))
+            circle = [*circle[first:], *circle[:first]]
+            circles.append(tuple(f"{names[k]}.{variable}" for k, variable in circle))
+    return tuple(sorted(circles))
 
 
 def _few(names: tuple[str, ...]) -> str:

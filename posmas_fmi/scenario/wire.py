@@ -61,6 +61,24 @@ class Instance:
         """
         converted(self.about, PortMap.plain((variable,), place))
 
+    def check_input(self, variable: str, place: str) -> None:
+        """Refuse what is no single number that may be set while the FMU runs.
+
+        Raises
+        ------
+        InputError
+        """
+        self.check(variable, place)
+        about, one = self.about, self.about.variable(variable)
+        tunable = one.causality == "parameter" and one.variability == "tunable"
+        if about.version > 1 and one.causality != "input" and not tunable:
+            inputs = [v.name for v in about.variables.values() if v.causality == "input"]
+            raise InputError(
+                f"{about.path.name}: {variable!r} cannot be set while it runs, its causality is "
+                f"{one.causality}; inputs: {', '.join(inputs[:8]) or 'none'}",
+                place,
+            )
+
     def wants(self, variable: str) -> int:
         """Place of a variable among the readings, which it is added to if need be."""
         if variable not in self.more:
@@ -147,11 +165,11 @@ def _weights(table: ConnectionTable, sources: int, place: str) -> list[float]:
     """Scale of each source of a connection."""
     if not isinstance(table.scale, list):
         return [1.0 if table.scale is None else table.scale] * sources
-    if len(table.scale) != sources or not table.sum:
+    if not table.sum:
+        raise InputError("expected a number; a list is for sum = true, one for each agent", place)
+    if len(table.scale) != sources:
         raise InputError(
-            f"expected a number, or with sum = true {sources}, one for each agent "
-            f"(got {len(table.scale)})",
-            place,
+            f"expected {sources} numbers, one for each agent (got {len(table.scale)})", place
         )
     return table.scale
 
@@ -210,7 +228,7 @@ class Wires:
             if signal not in self._columns:
                 known = ", ".join(self._columns) or "none"
                 raise InputError(f"there is no signal {signal!r} in [signals] ({known})", where)
-            self._all[instance].check(variable, where)
+            self._all[instance].check_input(variable, where)
             found = self._columns[signal]
             count = found.count
             if count > 1 and instance >= len(self._agents):
@@ -281,7 +299,7 @@ class Wires:
         own = dict(zip(readings, weights, strict=True))
 
         def add(target: int, variable: str, chosen: list[_Reading]) -> None:
-            self._all[target].check(variable, f"{place}.to")
+            self._all[target].check_input(variable, f"{place}.to")
             bias, terms = 0.0 if table.offset is None else table.offset, []
             for reading in chosen:
                 weight = own[reading]
