@@ -259,6 +259,21 @@ def test_check_sets_discrete_inputs_of_a_model_in_event_mode(
     assert not [f for f in made.findings if f.code == "status-error"]
 
 
+@pytest.mark.parametrize("nominal", ["0", "-300"])
+def test_nominal_values_that_are_no_sizes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nominal: str
+) -> None:
+    """Public FMUs of Dymola say 0: with that as absolute tolerance no integration begins."""
+    old = "return c ? (fmi2Status)instance_get_nominals(INSTANCE(c), x_nominal, nx) : fmi2Error;"
+    new = f"x_nominal[0] = {nominal};\n    return c && nx == 1 ? fmi2OK : fmi2Error;"
+    test_engine.changed(monkeypatch, 2, old, new)
+    path = only_me(tank_fmu(tmp_path, 2), tmp_path / "me.fmu")
+    with open_fmu(path) as file, file.instantiate("a") as instance:
+        instance.initialise({"temperature": 0.0, "power": 0.0})
+        instance.do_step(0.0, 25.0)
+        assert instance.get("temperature") == pytest.approx(290.0 * (1 - np.exp(-1.0)), rel=1e-5)
+
+
 @pytest.mark.parametrize("engine", ["c", "numpy"])
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_models_in_a_scenario(tmp_path: Path, engine: str, fmi: int) -> None:

@@ -162,8 +162,9 @@ class ModelExchangeInstance(FmuInstance):
         return self._vector(name, self.n_states)
 
     def nominals(self) -> Array:
-        """Return the typical sizes of the continuous states, (n_states,)."""
-        return self._vector("GetNominalsOfContinuousStates", self.n_states)
+        """Return the typical sizes of the continuous states, (n_states,); 1 where it says 0."""
+        values = np.abs(self._vector("GetNominalsOfContinuousStates", self.n_states))
+        return np.where(values > 0, values, 1.0)
 
     def event_indicators(self) -> Array:
         """Return the event indicators, (n_indicators,); a sign change is a state event."""
