@@ -7,6 +7,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import tempfile
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -58,20 +59,23 @@ def call_apart(function: str, arguments: tuple[Any, ...], deadline: float, memor
     """
     job = pickle.dumps((function, arguments, deadline, memory))
     package = str(Path(posmas_fmi.__file__).resolve().parents[1])
-    try:
-        done = subprocess.run(  # which ends the process whatever happens here
-            [sys.executable, "-P", "-c", _CODE, package],
-            input=job,
-            capture_output=True,
-            timeout=deadline + START,
-            start_new_session=True,  # Ctrl-C is for us
-            env={**os.environ, **_ONE_THREAD},
-        )
-    except subprocess.TimeoutExpired:
-        raise ApartError(_late(deadline)) from None
-    if done.returncode:
-        raise ApartError(_ending(done.returncode, done.stderr, deadline))
-    good, result = pickle.loads(done.stdout)
+    with tempfile.TemporaryFile() as answer:  # for many numbers, much quicker than a pipe
+        try:
+            done = subprocess.run(  # which ends the process whatever happens here
+                [sys.executable, "-P", "-c", _CODE, package],
+                input=job,
+                stdout=answer,
+                stderr=subprocess.PIPE,
+                timeout=deadline + START,
+                start_new_session=True,  # Ctrl-C is for us
+                env={**os.environ, **_ONE_THREAD},
+            )
+        except subprocess.TimeoutExpired:
+            raise ApartError(_late(deadline)) from None
+        if done.returncode:
+            raise ApartError(_ending(done.returncode, done.stderr, deadline))
+        answer.seek(0)
+        good, result = pickle.load(answer)
     if not good:
         raise result
     return result
@@ -110,10 +114,9 @@ def main() -> None:
         result: tuple[bool, Any] = True, called(*arguments)
     except Exception as error:
         result = False, error
-    data = pickle.dumps(result, protocol=5)
     _alarm(0.0)
     with os.fdopen(answer, "wb") as file:
-        file.write(data)
+        pickle.dump(result, file, protocol=5)
     os._exit(0)  # a library may be in no state to clean up
 
 
