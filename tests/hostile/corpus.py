@@ -412,6 +412,8 @@ BINARY = [
            change=_binary(lambda d: d[: len(d) // 2])),
     Defect("binary architecture", "the library is for another processor", "fatal",
            "binary-architecture", change=_binary(lambda d: d[:18] + b"\x08\x00" + d[20:])),
+    Defect("no dependency", "a library that it needs is not there", "fatal", "not-loaded", "dlopen",
+           change=_binary(lambda d: d.replace(b"\0libc.so.6\0", b"\0libq.so.6\0"))),
     Defect("no doStep", "fmi2DoStep is missing", "fatal", "function-missing",
            change=_symbol("fmi2DoStep")),
     Defect("no reset", "fmi2Reset is missing", "error", "function-missing",

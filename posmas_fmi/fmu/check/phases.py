@@ -122,7 +122,7 @@ class Trial:
     def _failed(self, text: str, call: str = "") -> None:
         journal = self.journal
         board = journal.board
-        severity = journal.severity
+        severity, remedy = journal.severity, ""
         if board.phase == "control":
             journal.note("note", "no-control-report", call or board.call, text[:500])
             return
@@ -130,6 +130,9 @@ class Trial:
             code = "no-instance"
         elif "binary cannot be loaded" in text:
             code = "not-loaded"
+            text = text[text.index("the binary cannot be loaded") :]
+            if "shared object file" in text:
+                remedy = "install that library, or export the FMU with it inside"
         elif "asked to end" in text:
             code = "terminates"
             severity = "fatal" if board.vital else "note"
@@ -137,7 +140,7 @@ class Trial:
             code = "stuck"
         else:
             code = f"{board.phase}-failed"
-        journal.note(severity, code, call or board.call or board.phase, text[:500])
+        journal.note(severity, code, call or board.call or board.phase, text[:500], remedy)
 
     # ---- instances ------------------------------------------------------------------------------
 
