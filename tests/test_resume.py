@@ -84,6 +84,45 @@ def test_a_branch_has_the_same_past_and_another_future(tmp_path: Path) -> None:
     assert np.abs(second["s"].values[-1] - first["s"].values[-1]).max() > 0.5
 
 
+@pytest.mark.parametrize("at", [205, 270])
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_branch_that_was_interrupted_goes_on_as_that_branch(
+    tmp_path: Path, at: int, every: int
+) -> None:
+    """Before its first snapshot it begins where the branch did, not at the start."""
+    run(made(tmp_path), tmp_path / "first", report=False)
+    (tmp_path / "other").mkdir()
+    jump = f"{LOSSY}[record]\nevery = {every}\n[[leader.jump]]\nat = 1.1\ns = [3.0, 3.0]\n"
+    what_if, branch = made(tmp_path / "other", jump), (tmp_path / "first", 1.0)
+    run(what_if, tmp_path / "whole", report=False, branch=branch)
+    run(what_if, tmp_path / "broken", interrupted(at), report=False, branch=branch)
+    again = run(what_if, tmp_path / "broken", report=False, resume=True)
+    assert again.summary["ended"] == "complete"
+    assert "baseline" not in again.summary
+    same(results(tmp_path / "broken"), results(tmp_path / "whole"))
+    assert results(tmp_path / "whole")["time"].values[0] == pytest.approx(1.0, abs=0.035)
+
+
+def test_what_is_inside_of_a_snapshot_cannot_be_another(tmp_path: Path) -> None:
+    """FMUs, their start values, the channel's arcs: nothing of another one is taken for them."""
+    definition, first = made(tmp_path), tmp_path / "first"
+    run(definition, first, report=False)
+    network, plant = definition.network, definition.plant
+    for other, told in (
+        (attrs.evolve(definition, plant=attrs.evolve(plant, fmi=2)), "the FMUs are not those"),
+        (attrs.evolve(definition, plant=attrs.evolve(plant, parameters={"A": [[-2.0, 0.0], [0, -2]]})),
+         "start values are not those of that run"),
+        (attrs.evolve(definition, network=network.with_pinned(range(network.N))), "another system: held"),
+        (made(tmp_path, LOSSY, until=1.0), r"ends at 1 s, no later than that snapshot"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=told):
+            run(other, tmp_path / "b", report=False, branch=(first, 1.0))
+    shots = first / "snapshots"
+    (shots / "100.npz").write_bytes((shots / "200.npz").read_bytes())
+    with pytest.raises(InputError, match="it is of communication point 200"):
+        run(definition, tmp_path / "b", report=False, branch=(first, 0.5))
+
+
 def test_a_run_that_is_cut_off_at_its_start_has_nothing_of_the_one_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

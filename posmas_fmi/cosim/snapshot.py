@@ -80,6 +80,8 @@ class Snapshot:
                 count = sum(name.startswith("fmu_") for name in content.files)
                 states = tuple(content[f"fmu_{k}"].tobytes() for k in range(count))
             serialised = states if facts["serialised"] else None
+            if path.stem.isdigit() and int(path.stem) != int(facts["k"]):
+                raise ValueError(f"it is of communication point {facts['k']}")
             return cls(int(facts["k"]), arrays, dict(facts["counts"]), serialised)
         except Exception as error:  # whatever NumPy and zipfile raise on a broken file
             raise InputError(f"this is not a snapshot of a run: {error}", str(path)) from None

@@ -37,7 +37,7 @@ from posmas_fmi.scenario.build import Scenario, make_channel
 from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.folder import occupied
-from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances
+from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, parameters
 from posmas_fmi.scenario.resume import Beginning, branched, forget_snapshots, resumed, snapshots
 from posmas_fmi.scenario.schedule import Schedule, make_schedule, schedule_of
 from posmas_fmi.scenario.verdict import summarise
@@ -216,8 +216,9 @@ def _run_in(
     if resume:
         beginning = resumed(scenario, folder, told)
     elif branch is not None:
-        beginning = branched(scenario, *branch)
-        told["branch"] = {"of": branch[0].name, "at": branch[1]}
+        beginning = branched(scenario, *branch, told)
+    if beginning.branch:
+        told["branch"] = beginning.branch
         scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
     if scenario.cooling is not None:
@@ -503,7 +504,7 @@ def _recorder(
 ) -> Recorder:
     agent, recorded = scenario.agent, instances.recorded
     steps, every = scenario.clock.steps, scenario.record.every
-    before = -(-beginning.k // every) if beginning.keep is None else 0  # those of another run
+    before = -(-beginning.origin // every)  # those of another run
     expected = steps // every + 1 + (steps % every > 0) - before
     layout = Layout(
         agents=network.names,
@@ -536,6 +537,7 @@ def manifest(
         "period": scenario.clock.h,
         "until": scenario.clock.time(scenario.clock.steps),
         "fmus": {path.name: _hash(path.read_bytes()) for path in dict.fromkeys(files)},
+        "start_values_sha256": _hash(json.dumps(parameters(scenario), default=str).encode()),
         "inputs": {path.name: _hash(path.read_bytes()) for path in scenario.inputs},
         "versions": {name: metadata.version(name) for name in PACKAGES},
         "python": platform.python_version(),

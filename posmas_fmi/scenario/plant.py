@@ -308,6 +308,18 @@ def _values(scenario: Scenario, k: int) -> dict[str, Any]:
     return values
 
 
+def parameters(scenario: Scenario) -> list[Any]:
+    """Return what a scenario says about start values, of agents and of components."""
+    plant = scenario.plant
+    of_agents = [plant.fmu, plant.parameters]
+    of_some = [[one.agent, one.fmu, one.parameters] for one in plant.override]
+    return [
+        of_agents,
+        of_some,
+        [[one.name, one.fmu, one.parameters] for one in scenario.components],
+    ]
+
+
 def _check_values(scenario: Scenario, instances: Sequence[Instance]) -> None:
     """Refuse start values that an FMU does not have, or of another type or shape."""
     known, problems = set(), []

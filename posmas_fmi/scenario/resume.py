@@ -24,6 +24,7 @@ SAME = {  # what must not have changed in a run that goes on
     "fmus": "the FMUs",
     "inputs": "the input files",
 }
+INSIDE = {"fmus": "the FMUs", "start_values_sha256": "start values"}  # of what snapshots hold
 
 
 @attrs.frozen(eq=False)
@@ -36,10 +37,17 @@ class Beginning:
         None: at the start.
     keep : int or None
         Rows of the results that are kept; None: results of their own.
+    origin : int
+        The communication point where its results begin: of a branch, that of the snapshot that it
+        began with.
+    branch : dict
+        What the manifest says about a branch; empty for other runs.
     """
 
     snapshot: Snapshot | None = None
     keep: int | None = None
+    origin: int = 0
+    branch: dict[str, Any] = attrs.field(factory=dict)
 
     @property
     def k(self) -> int:
@@ -75,29 +83,42 @@ def resumed(scenario: Scenario, folder: Path, manifest: dict[str, Any]) -> Begin
     if complete:
         raise InputError("the run is complete: there is nothing to go on with", str(folder))
     every = scenario.record.every
-    found = newest(folder / FOLDER, rows * every)
+    branch = before.get("branch") or {}
+    origin = round(branch.get("at", 0.0) / scenario.clock.h)
+    earlier = -(-origin // every)  # rows that a branch does not have
+    found = newest(folder / FOLDER, min((rows + earlier) * every, scenario.clock.steps))
     if found is None:
+        if branch:
+            raise InputError(
+                "the snapshot that this branch began with is gone; make the branch again",
+                str(folder / FOLDER),
+            )
         return Beginning()
     snapshot = Snapshot.load(found)
-    return Beginning(snapshot, -(-snapshot.k // every))
+    keep = -(-snapshot.k // every) - earlier
+    return Beginning(snapshot, keep or None, origin, branch)
 
 
-def branched(scenario: Scenario, folder: Path, at: float) -> Beginning:
+def branched(scenario: Scenario, folder: Path, at: float, manifest: dict[str, Any]) -> Beginning:
     """Return a beginning at a snapshot of another run.
 
     Parameters
     ----------
     scenario : Scenario
-        With which the run goes on: agents, FMUs and network of the same sizes.
+        With which the run goes on: the same FMUs with the same start values, agents and network
+        of the same sizes.
     folder : Path
         Of the other run.
     at : float
         Time of the snapshot [s].
+    manifest : dict
+        Of the run that begins.
 
     Raises
     ------
     InputError
-        If there is none at that time, or the period is another.
+        If there is none at that time, the run ends by then, or the period, an FMU or a start value
+        is another.
     """
     before = _manifest(folder)
     if before.get("period") != scenario.clock.h:
@@ -116,7 +137,21 @@ def branched(scenario: Scenario, folder: Path, at: float) -> Beginning:
             "one every S seconds",
             str(folder),
         )
-    return Beginning(Snapshot.load(path))
+    if k >= scenario.clock.steps:
+        raise InputError(
+            f"the run ends at {scenario.clock.time(scenario.clock.steps):g} s, no later than that "
+            "snapshot: give --until S",
+            "$.scenario.until",
+        )
+    for key, what in INSIDE.items():
+        if key in before and before[key] != manifest[key]:
+            raise InputError(
+                f"{what} are not those of that run ({key}), and they are part of its snapshots; "
+                "what is to be different must begin at the snapshot or later, as a fault, a jump "
+                "of the leader or a signal does",
+                str(folder / "manifest.json"),
+            )
+    return Beginning(Snapshot.load(path), None, k, {"of": folder.name, "at": at})
 
 
 def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapshots:
@@ -124,8 +159,11 @@ def snapshots(scenario: Scenario, folder: Path, beginning: Beginning) -> Snapsho
     place = folder / FOLDER
     every = round(scenario.settings.snapshot / scenario.clock.h)
     forget_snapshots(folder, beginning.k if beginning.keep is not None else -1)
-    if every:
+    if every or beginning.branch:
         place.mkdir(exist_ok=True)
+    if beginning.branch and beginning.k == beginning.origin:  # to go on with, if it is cut off
+        assert beginning.snapshot is not None
+        beginning.snapshot.save(place / f"{beginning.k}.npz")
 
     def keep(snapshot: Snapshot) -> None:
         snapshot.save(place / f"{snapshot.k}.npz")
