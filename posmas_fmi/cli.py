@@ -137,6 +137,8 @@ def _run(arguments: argparse.Namespace) -> int:
         other = "no (the certificate of the design is not about the law that ran)"
         print(f"certified  {_certified(result.design) if of_law else other}")
         uncovered = [one["what"] for one in summary["coverage"] if not one["covered"]]
+        faults = (f for f in summary.get("faults", ()) if not f["covered"].startswith("covered"))
+        uncovered += dict.fromkeys(fault["kind"] for fault in faults)
         if uncovered and result.certified != "no":
             print(f"           that does not cover {', '.join(uncovered)}")
         print(f"error      {_number(summary['tracking_error_final'])} to the leader at the end")

@@ -10,7 +10,11 @@ import pytest
 import xarray
 
 from posmas_fmi import load, resources, run
+from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.errors import InputError, ScenarioError
+from posmas_fmi.network import network_from_arcs
+from posmas_fmi.scenario.faults import describe
+from posmas_fmi.scenario.tables import FaultTable
 
 DESIGN = 'method = "contraction"\nphi = 10.0'
 GIVEN = """method = "gains"
@@ -223,6 +227,26 @@ def test_a_run_that_ends_early_leaves_out_what_comes_later(
     assert "$.fault[0].at: begins at 1 s, but the run ends at 1 s: left out" in caplog.text
     assert "faults" not in summary
     xarray.testing.assert_equal(data["x"], plain[1]["x"])
+
+
+@pytest.mark.parametrize(
+    ("fault", "delays", "covered"),
+    [
+        ({"kind": "leader lost", "until": 1.0}, True, True),
+        ({"kind": "leader lost", "until": 1.0}, False, False),
+        ({"kind": "leader lost"}, True, False),  # no bound on the delay
+        ({"kind": "messages lost"}, True, False),
+        ({"kind": "messages lost", "value": 0.5}, True, True),
+        ({"kind": "arc off", "until": 1.0}, True, False),
+    ],
+)
+def test_lost_messages_are_covered_as_delays_that_have_an_end(
+    fault: dict[str, Any], delays: bool, covered: bool
+) -> None:
+    network = network_from_arcs(2, [(1, 2)], [1])
+    (row,) = describe([FaultTable(at=0.5, **fault)], network, Clock.of(2.0, 0.1), delays)
+    assert row["covered"].startswith("covered") is covered
+    assert row["covered"].startswith("not covered") is not covered
 
 
 @pytest.mark.parametrize(

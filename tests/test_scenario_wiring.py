@@ -137,6 +137,7 @@ def test_mistakes_name_their_place(name: str, folder: Path) -> None:
 
 BAD_FILES = {
     "gap": ("time,a\n0,1\n5,\n", "line 3"),
+    "semicolons": ("time;a\n0;1\n", "columns are separated by commas"),
     "not finite": ("time,a\n0,1\n5,nan\n", "line 3: a is not finite"),
     "order": ("time,a\n0,1\n5,2\n4,3\n", "line 4: expected increasing times"),
     "short row": ("time,a\n0\n", "line 2"),

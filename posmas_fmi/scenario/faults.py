@@ -27,12 +27,12 @@ KINDS = {
     "actuator slow": "goes a part of the way in each step; not covered",
     "messages lost": "the last message is held; covered by certificate D as a delay of at most "
     "the episode, if what is proved covers delays",
-    "leader lost": "the last state heard is held; covered by certificate D as a delay, so agents "
-    "agree on what was heard last while the leader may go on",
+    "leader lost": "the last state heard is held; covered by certificate D as a delay of at most "
+    "the episode, if what is proved covers delays; meanwhile the leader may go on",
     "FMU crash": "the process of the FMU is killed, what follows is [plant] on_failure; not "
     "covered: a frozen agent is heard with its last message and follows nobody",
-    "arc off": "the arc is not in the digraph; covered as long as the digraph without it is "
-    "certified by itself and changes are rare",
+    "arc off": "the arc is not in the digraph; not covered by itself: design again without the arc "
+    "to see whether that digraph is certified; changes must be rare",
 }
 
 
@@ -211,6 +211,17 @@ def _arcs(fault: FaultTable, network: Network, place: str) -> Any:
     return chosen
 
 
+def _covered(fault: FaultTable, delays: bool) -> str:
+    """Say why messages that are lost are not covered; nothing where they are."""
+    if fault.kind not in ("messages lost", "leader lost"):
+        return ""
+    if not delays:
+        return "not covered: certificate D, of delays, is not proved of what ran"
+    if fault.until is None and (fault.value is None or fault.value >= 1.0):
+        return "not covered: what is held there never changes, a delay without bound"
+    return ""
+
+
 def _where(fault: FaultTable, network: Network) -> str:
     """Say on which agents or arcs."""
     names = ("leader", *network.names)
@@ -222,8 +233,19 @@ def _where(fault: FaultTable, network: Network) -> str:
     return ", ".join(names[n] for n in fault.agents) or "all"
 
 
-def describe(faults: list[FaultTable], network: Network, clock: Clock) -> list[dict[str, Any]]:
-    """Say for summary.json what was otherwise, when, and what is proved of it."""
+def describe(
+    faults: list[FaultTable], network: Network, clock: Clock, delays: bool = True
+) -> list[dict[str, Any]]:
+    """Say for summary.json what was otherwise, when, and what is proved of it.
+
+    Parameters
+    ----------
+    faults : list of FaultTable
+    network : Network
+    clock : Clock
+    delays : bool
+        Whether what is proved covers delays.
+    """
     rows = []
     for fault in faults:
         detail, _, covered = KINDS[fault.kind].partition("; ")
@@ -235,7 +257,7 @@ def describe(faults: list[FaultTable], network: Network, clock: Clock) -> list[d
                 "from": clock.time(begin),
                 "until": None if end == NEVER else clock.time(end),
                 "detail": detail,
-                "covered": covered,
+                "covered": _covered(fault, delays) or covered,
             }
         )
     return rows

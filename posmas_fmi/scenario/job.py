@@ -247,7 +247,14 @@ def _run_in(
         summary["messages"] = [start_value(finding) for finding in told["start_values"]]
     summary["coverage"] = coverage(scenario, designed)
     if scenario.faults:
-        summary["faults"] = describe(list(scenario.faults), designed.network, scenario.clock)
+        summary["faults"] = describe(
+            list(scenario.faults),
+            designed.network,
+            scenario.clock,
+            bool(designed.certificate.delays)
+            and facts["certified"] != "no"
+            and scenario.control.python is None,
+        )
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
         keys = ("verdict", "tracking_error_final", "min_state")

@@ -291,8 +291,9 @@ def _read(path: Path, place: str) -> tuple[list[str], Array]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path.name} cannot be read as CSV: {error}", where) from None
     if len(rows) < 2 or len(rows[0]) < 2:
+        comma = "; columns are separated by commas" if rows and ";" in "".join(rows[0]) else ""
         raise InputError(
-            f"{path.name}: expected a header, a column of times and one of values", where
+            f"{path.name}: expected a header, a column of times and one of values{comma}", where
         )
     header = [name.strip() for name in rows[0]]
     numbers = np.empty((len(rows) - 1, len(header)))
