@@ -178,12 +178,12 @@ def test_options_replace_what_the_file_says():
 def test_single_arcs_of_the_channel(tmp_path):
     text = TEXT + (
         "\n[channel]\nloss = 0.1\n[[channel.arc]]\narc = [4, 2]\ndelay = 0.012\n"
-        "[[channel.arc]]\narc = [0, 2]\nloss = 0.5\n"
+        "[[channel.arc]]\narc = [0, 2]\nloss = 0.5\njitter = 0.0\n"
     )
     scenario = load(write(tmp_path, text))
     channel = make_channel(scenario.channel, scenario.network, scenario.clock.h)
     # rows of the adjacency: 1 hears 2, 3; 2 hears 4; 3 hears 1, 2; 4 hears 1; then the leader
     np.testing.assert_array_equal(channel.delay, [0, 0, 3, 0, 0, 0, 0])
-    np.testing.assert_allclose(channel.loss, [0.1, 0.1, 0.0, 0.1, 0.1, 0.1, 0.5])
+    np.testing.assert_allclose(channel.loss, [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.5])
     with pytest.raises(PosmasError, match="no arc from 2 to 4"):
         load(write(tmp_path, TEXT + "\n[[channel.arc]]\narc = [2, 4]\n"))

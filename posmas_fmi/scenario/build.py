@@ -643,8 +643,14 @@ def make_channel(table: ChannelTable, network: Network, h: float) -> Channel:
                 f"there is no arc from {arc.arc[0]} to {arc.arc[1]} in the network", f"{place}.arc"
             )
         try:
-            one = Channel.uniform(1, h, arc.delay, arc.jitter, arc.loss)
+            one = Channel.uniform(1, h, arc.delay or 0.0, arc.jitter or 0.0, arc.loss or 0.0)
         except InputError as error:
             raise InputError(error.message, f"{place}.{error.where.split('.')[-1]}") from None
-        delay[number], jitter[number], loss[number] = one.delay[0], one.jitter[0], one.loss[0]
+        for of_all, given, own in (
+            (delay, arc.delay, one.delay),
+            (jitter, arc.jitter, one.jitter),
+            (loss, arc.loss, one.loss),
+        ):
+            if given is not None:
+                of_all[number] = own[0]
     return Channel(delay, jitter, loss, table.resolution)

@@ -39,7 +39,7 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
     arcs: list[ChannelTable | ArcTable] = [channel, *channel.arc]
     if any(c.delay or c.jitter for c in arcs):
         rows.append(("delay of messages", proved, _delays(designed)))
-    if any(c.loss >= 1.0 for c in arcs):
+    if any((c.loss or 0.0) >= 1.0 for c in arcs):
         rows.append(
             ("arcs over which nothing ever arrives", False, "what is held there never changes")
         )

@@ -492,14 +492,14 @@ class ArcTable:
     ----------
     arc : (int, int)
         ``[from, to]``, by agent numbers from 1; 0 is the leader.
-    delay, jitter, loss : float
-        As in ``[channel]``.
+    delay, jitter, loss : float, optional
+        As in ``[channel]``; what is left out is as there.
     """
 
     arc: tuple[int, int]
-    delay: float = 0.0
-    jitter: float = 0.0
-    loss: float = 0.0
+    delay: float | None = None
+    jitter: float | None = None
+    loss: float | None = None
 
 
 @attrs.frozen
