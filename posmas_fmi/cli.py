@@ -90,6 +90,7 @@ def keep_interrupts() -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.fmu.prints import prints_to_stderr
     from posmas_fmi.scenario import load, run
 
     scenario = load(
@@ -119,9 +120,10 @@ def _run(arguments: argparse.Namespace) -> int:
             raise InputError("a branch needs a folder of its own: give --out DIR", str(folder))
         branch = (arguments.branch, arguments.at)
     command = _command_line(arguments)
-    result = run(
-        scenario, folder, _progress, command=command, resume=arguments.resume, branch=branch
-    )
+    with prints_to_stderr():
+        result = run(
+            scenario, folder, _progress, command=command, resume=arguments.resume, branch=branch
+        )
     summary = result.summary
     if arguments.json:
         _print_json({**summary, "certified": result.certified, "folder": str(folder)})

@@ -1,5 +1,6 @@
 """The documentation names what is there."""
 
+import json
 import os
 import re
 import runpy
@@ -168,6 +169,8 @@ def test_the_controller_of_the_page_runs_and_its_failure_is_told(tmp_path, capsy
     (tmp_path / "follow.py").write_text(law, encoding="utf-8")
     made = posmas_fmi.run(posmas_fmi.load(path, until=10.0), out)
     assert made.summary["verdict"] == "converged"
+    assert made.design.certificate.certified == "yes"
+    assert made.certified == json.loads((out / "design.json").read_text())["certified"] == "no"
     (uncovered,) = made.summary["coverage"]
     assert not uncovered["covered"]
     law = law.replace("target = ", "t > 0.95 and 1 / 0\n        target = ")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +12,7 @@ import attrs
 import numpy as np
 import pytest
 
+from posmas_fmi import resources
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.channel import Channel
@@ -277,3 +281,19 @@ def test_classes_from_files(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             load_class(text, tmp_path)
+
+
+def test_what_a_controller_prints_is_not_in_the_results(tmp_path: Path) -> None:
+    """Nor what it tells file descriptor 1."""
+    (tmp_path / "mine.py").write_text(
+        "import os\nclass Mine:\n    def __init__(self, number): print('made')\n"
+        "    def step(self, t, y, neighbours, s):\n        print('asked')\n"
+        "        os.write(1, b'told')\n        return 0.0\n"
+    )
+    text = (resources.shipped("models") / "paper_example_1_tanh.toml").read_text()
+    (tmp_path / "one.toml").write_text(f'{text}\n[control]\npython = "mine.py:Mine"\n')
+    command = [sys.executable, "-m", "posmas_fmi", "run", "one.toml", "--until", "0.01", "--json"]
+    made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert json.loads(made.stdout)["certified"] == "no"
+    assert made.returncode == 1
+    assert all(word in made.stderr for word in ("made", "asked", "told"))

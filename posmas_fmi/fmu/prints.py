@@ -1,4 +1,4 @@
-"""What FMUs print belongs on standard error: standard output is for results."""
+"""What FMUs and controllers print belongs on standard error: standard output is for results."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ def prints_to_stderr() -> Iterator[None]:
         os.dup2(2, 1)
         yield
     finally:
+        sys.stdout.flush()  # what Python code has printed
         _flush_c()
         os.dup2(kept, 1)
         os.close(kept)

@@ -27,6 +27,7 @@ from posmas_fmi.design import Design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
+from posmas_fmi.scenario.coverage import not_about
 from posmas_fmi.scenario.signals import Signal, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
@@ -425,20 +426,13 @@ def proved(table: ControlTable, designed: Design) -> dict[str, Any]:
     if is_certified(table, designed):
         leakage = [LEAKAGE_NOTE] if designed.K_q is not None else []
         return {"notes": [note, *leakage]} if note else {}
-    return {
-        "certified": "no",
-        "conditions": [],
-        "covers": [],
-        "rate": None,
-        "observer_rate": None,
-        "rate_perron": None,
-        "positive": False,
-        "notes": [f"The certificate of the design is not about this law, {table.law!r}. {note}"],
-    }
+    return not_about(f"this law, {table.law!r}. {note}")
 
 
 def is_certified(table: ControlTable, designed: Design) -> bool:
     """Whether the certificate of the design is about the law, with the gains that it runs."""
+    if table.python is not None:
+        return False
     certified = ("integral", "integral_ff") if designed.K_q is not None else ("proportional",)
     own = {"K", "E", "K_q"} & set(table.parameters)
     return table.law == "protocol" or (table.law in certified and not own)

@@ -34,7 +34,7 @@ from posmas_fmi.fmu.start_values import told as start_value
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
-from posmas_fmi.scenario.coverage import coverage
+from posmas_fmi.scenario.coverage import coverage, not_about
 from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, parameters
@@ -221,7 +221,9 @@ def _run_in(
         told["branch"] = beginning.branch
         scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
     facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
-    if scenario.cooling is not None:
+    if scenario.control.python is not None:
+        facts |= not_about(f"controllers of one's own, {scenario.control.python!r}.")
+    elif scenario.cooling is not None:
         from posmas_fmi.scenario.cooling import proved
 
         facts |= proved(scenario.control, designed)
