@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DONE, NEGATIVE, CANCELLED = 0, 1, 130
 _SHOWN = 12  # agents in a list
+_LARGEST_GAINS = 100_000_000  # bytes
 _SCENARIO = "a file, or the name of a shipped scenario"
 
 
@@ -478,8 +479,10 @@ def _progress(label: str) -> Progress | None:
 
 def _read_gains(path: Path) -> tuple[Any, Any, Any]:
     """Read K, E and K_q, where there is one, from a JSON file, also from a design.json."""
+    from posmas_fmi.bounded import read_bounded
+
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_bounded(path, _LARGEST_GAINS))
     except (OSError, ValueError) as error:
         raise InputError(
             f'expected a JSON file like {{"K": [[..]], "E": [[..]]}} ({error})', str(path)

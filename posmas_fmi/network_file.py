@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.errors import NetworkError
 from posmas_fmi.network import check_size
 
@@ -41,6 +42,7 @@ def read_adjacency(path: Path) -> tuple[sp.csr_array, tuple[str, ...]]:
             f"expected a .csv, .mtx or .graphml file (got {path.name})", "$.network.file"
         )
     try:
+        require_regular(path)
         if path.stat().st_size > LARGEST_FILE:
             raise NetworkError(
                 f"{path.name} is larger than {LARGEST_FILE:g} bytes", "$.network.file"

@@ -11,7 +11,7 @@ ROOT = Path(posmas_fmi.__file__).parent
 FLOORS = {
     "errors": 0, "expression": 0, "interval": 0, "agent": 0, "network": 0, "network_file": 0,
     "resources": 0, "sector": 0, "protocol": 0, "writing": 0, "interrupt": 0, "apart": 0,
-    "netcdf": 0,
+    "bounded": 0, "netcdf": 0,
     "certify": 1, "fmu": 1,
     "design": 2,
     "cosim": 3, "export": 3,

@@ -14,7 +14,9 @@ from test_scenario_faults import scenario
 
 from posmas_fmi import load, run
 from posmas_fmi.cli import main
+from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import InputError, ScenarioError
+from posmas_fmi.fmu.compare import read_reference
 
 MINE = """
 import numpy as np
@@ -157,3 +159,55 @@ def test_an_fmu_that_cannot_be_read_is_a_mistake_of_the_scenario(
     path = one_fmu(tmp_path, empty, '"power"', '"temperature"')
     assert main(["run", path, "--out", str(tmp_path / "out")]) == 2
     assert "$.plant.fmu: empty.fmu: expected an FMU (the file is empty" in capsys.readouterr().err
+
+
+PIPES = {
+    "signal": ('[signals.a]\nfile = "pipe.csv"\n', "$.signals.a.file: pipe.csv"),
+    "network": ("", "$.network.file: cannot read pipe.csv"),
+}
+
+
+@pytest.mark.parametrize("kind", PIPES)
+def test_a_pipe_that_a_scenario_names_is_not_waited_for(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It hung for ever."""
+    more, told = PIPES[kind]
+    path = Path(one_fmu(tmp_path, tank_fmu(tmp_path, 2), '"power"', '"temperature"', more))
+    os.mkfifo(tmp_path / "pipe.csv")
+    if kind == "network":
+        before, _, after = path.read_text().partition("[network]")
+        _, _, after = after.partition("[plant]")
+        path.write_text(f'{before}[network]\nfile = "pipe.csv"\npinned = [1]\n[plant]{after}')
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert told in said
+    assert "it is no regular file" in said
+
+
+def test_a_pipe_in_the_folder_of_a_run_is_not_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "manifest.json")
+    assert main(["report", str(tmp_path)]) == 2
+    assert "it is no regular file" in capsys.readouterr().err
+    branch = ["--branch", str(tmp_path), "--at", "1", "--out", str(tmp_path / "out")]
+    assert main(["run", "paper_example_1", *branch]) == 2
+    assert "there is no run to go on with" in capsys.readouterr().err
+    with pytest.raises(InputError, match="it is no regular file"):
+        Snapshot.load(tmp_path / "manifest.json")
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs /dev/zero")
+@pytest.mark.parametrize(
+    "arguments",
+    [["run", "/dev/zero"], ["certify", "paper_example_1", "--gains", "/dev/zero"]],
+)
+def test_a_file_without_an_end_is_not_read_to_it(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It took all memory."""
+    assert main(arguments) == 2
+    assert "it is larger than" in capsys.readouterr().err
+    with pytest.raises(InputError, match="it is larger than"):
+        read_reference("/dev/zero")

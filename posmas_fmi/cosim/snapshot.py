@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
@@ -73,6 +74,7 @@ class Snapshot:
             If the file is not a snapshot.
         """
         try:
+            require_regular(path)
             with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
                 facts = json.loads(content["facts"].tobytes())
                 names = [name for name in content.files if name.startswith("array_")]

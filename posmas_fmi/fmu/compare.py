@@ -10,12 +10,15 @@ from pathlib import Path
 import attrs
 import numpy as np
 
+from posmas_fmi.bounded import read_bounded
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance
 
 _BAND = re.compile(r"#\s*band:\s*height\s*=\s*(\S+?),?\s+width\s*=\s*(\S+)\s*$")
+
+LARGEST_FILE = 200_000_000  # bytes
 
 
 @attrs.frozen
@@ -127,7 +130,7 @@ def read_reference(path: str | Path) -> Reference:
     """
     where = str(path)
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = read_bounded(Path(path), LARGEST_FILE).decode("utf-8").splitlines()
     except (OSError, ValueError) as error:
         raise InputError(f"expected a CSV file ({error})", where) from error
     band = Band()

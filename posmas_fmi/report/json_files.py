@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 
 from posmas_fmi.agent import Assumption, Status
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.report.data import (
@@ -30,6 +31,7 @@ from posmas_fmi.report.foreign import AGAIN, clean, number, one_line
 def read_json(path: Path) -> dict[str, Any]:
     """Read a file that holds one JSON object; InputError if it does not."""
     try:
+        require_regular(path)
         content = _cleaned(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise InputError(f"the file is missing; {AGAIN}", str(path)) from None

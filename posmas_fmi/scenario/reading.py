@@ -21,6 +21,7 @@ from cattrs.errors import (
     IterableValidationNote,
 )
 
+from posmas_fmi.bounded import read_bounded
 from posmas_fmi.design import DesignSettings
 from posmas_fmi.errors import InputError, PosmasError, ScenarioError
 from posmas_fmi.scenario.paths import data_files, leaving
@@ -208,7 +209,7 @@ def _read_text(path: Path) -> str:
                 "keep large networks in a file of their own ($.network.file)",
                 str(path),
             )
-        return path.read_bytes().decode("utf-8")
+        return read_bounded(path, LARGEST_FILE).decode("utf-8")
     except FileNotFoundError:
         raise InputError(
             "no such file; 'posmas-fmi models' lists the shipped scenarios", str(path)

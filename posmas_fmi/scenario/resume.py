@@ -10,6 +10,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.cosim.recorder import written_rows
 from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, newest
 from posmas_fmi.errors import InputError
@@ -181,6 +182,7 @@ def forget_snapshots(folder: Path, after: int = -1) -> None:
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / "manifest.json"
     try:
+        require_regular(path)
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise InputError("there is no run to go on with", str(folder)) from None

@@ -9,6 +9,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.cosim.clock import Clock
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
@@ -282,6 +283,7 @@ def _read(path: Path, place: str) -> tuple[list[str], Array]:
     """Header and numbers of a CSV file; every cell must be a finite number."""
     where = f"{place}.file"
     try:
+        require_regular(path)
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"{path.name} is larger than {LARGEST_FILE:g} bytes", where)
         with path.open(newline="", encoding="utf-8-sig") as file:
