@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 from fmu_examples import example_1, named, vector
+from fmu_scenarios import one_fmu
 
+from posmas_fmi import load, run
 from posmas_fmi.errors import FmuError
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.instance import FmuInstance, Step
@@ -115,3 +118,42 @@ def test_an_fmu_that_never_gets_to_the_end_is_an_error(
         instance.initialise()
         with pytest.raises(FmuError, match="returned early 101 times"):
             instance.do_step(0.0, 0.1)
+
+
+LAG = """
+from pythonfmu3 import Float64, Fmi3Causality, Fmi3Slave, Fmi3Variability
+
+class Lag(Fmi3Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.time, self.u, self.y, self.rate = 0.0, 0.0, 1.0, 2.0
+        independent, continuous = Fmi3Causality.independent, Fmi3Variability.continuous
+        self.register_variable(Float64("time", causality=independent, variability=continuous))
+        self.register_variable(Float64("u", causality=Fmi3Causality.input))
+        self.register_variable(Float64("y", causality=Fmi3Causality.output))
+        self.register_variable(
+            Float64("rate", causality=Fmi3Causality.parameter, variability=Fmi3Variability.tunable)
+        )
+
+    def do_step(self, t, h):
+        self.y += h * self.rate * (self.u - self.y)
+        return True
+"""
+
+
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_an_fmi_3_fmu_of_pythonfmu3_in_a_scenario(tmp_path: Path, isolation: str) -> None:
+    """Agents of one that another tool has built, against what its Python says."""
+    builder = pytest.importorskip("pythonfmu3.builder", reason="pythonfmu3 is not installed")
+    script = tmp_path / "lag.py"
+    script.write_text(LAG, encoding="utf-8")
+    fmu = Path(builder.FmuBuilder.build_FMU(script, dest=tmp_path))
+    more = f'isolation = "{isolation}"\nparameters = {{rate = 3.0}}'
+    path = one_fmu(tmp_path, fmu, '"u"', '"y"', more, gain=-0.4)
+    summary = run(load(path), tmp_path / "out", report=False).summary
+    assert summary["ended"] == "complete", summary["reason"]
+    with xarray.open_dataset(tmp_path / "out" / "results.nc") as data:
+        u, y = data["u"].values, data["y"].values
+    np.testing.assert_allclose(y[1:], y[:-1] + 0.1 * 3.0 * (u[:-1] - y[:-1]), rtol=1e-12)
+    assert (y[0] == 1.0).all()
+    assert np.ptp(u) > 0.1
