@@ -14,6 +14,7 @@ from test_scenario_faults import scenario
 
 from posmas_fmi import load, run
 from posmas_fmi.cli import main
+from posmas_fmi.cooling.loads import read_loads
 from posmas_fmi.cosim.snapshot import Snapshot
 from posmas_fmi.errors import InputError, ScenarioError
 from posmas_fmi.fmu.compare import read_reference
@@ -196,6 +197,8 @@ def test_a_pipe_in_the_folder_of_a_run_is_not_waited_for(
     assert "there is no run to go on with" in capsys.readouterr().err
     with pytest.raises(InputError, match="it is no regular file"):
         Snapshot.load(tmp_path / "manifest.json")
+    with pytest.raises(InputError, match="it is no regular file"):
+        read_loads(tmp_path / "manifest.json")
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs /dev/zero")

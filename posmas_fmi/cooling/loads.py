@@ -13,6 +13,7 @@ from pathlib import Path
 import attrs
 import numpy as np
 
+from posmas_fmi.bounded import require_regular
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 
@@ -407,6 +408,7 @@ def read_loads(path: str | Path, max_gap: float | None = None) -> Loads:
 
 def _rows(path: Path, where: str) -> list[list[str]]:
     try:
+        require_regular(path)
         with path.open("rb") as file:
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
