@@ -215,6 +215,11 @@ def changed(tmp_path, old, new):
         ('u1 = "u[1]"', 'u1 = {variable = "u[1]", unit = "kg"}', "$.plant.inputs"),
         ('u1 = "u[1]"', 'u1 = {variable = "u[1]", scale = 0.0}', "$.plant.inputs.u1.scale"),
         ('"positive_agent"', '"missing.fmu"', "$.plant.fmu"),
+        (
+            "[leader]",
+            '[[plant.override]]\nagent = 2\nfmu = "missing.fmu"\n[leader]',
+            "$.plant.override[0].fmu",
+        ),
         ("[leader]", "[plant.parameters]\nQ = 1.0\n[leader]", "$.plant.parameters"),
     ],
 )

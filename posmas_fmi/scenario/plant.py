@@ -32,11 +32,11 @@ SHIPPED = "positive_agent"
 def fmu_files(scenario: Scenario) -> list[Path]:
     """Return the FMU of each agent, then of each component; shipped ones are built if need be."""
     plant = scenario.plant
-    chosen = [plant.fmu] * scenario.network.N
-    for override in plant.override:
+    wanted = [(plant.fmu, plant.fmi, "$.plant.fmu")] * scenario.network.N
+    for k, override in enumerate(plant.override):
         if override.fmu is not None:
-            chosen[override.agent - 1] = override.fmu
-    wanted = [(name, plant.fmi, "$.plant.fmu") for name in chosen]
+            place = f"$.plant.override[{k}].fmu"
+            wanted[override.agent - 1] = (override.fmu, plant.fmi, place)
     wanted += [
         (component.fmu, component.fmi, f"$.component[{k}].fmu")
         for k, component in enumerate(scenario.components)
