@@ -128,6 +128,9 @@ offset = 10.0
 """
     engine = 'auto"\ncoupling = "iterate'
     path = one_fmu(tmp_path, tank_fmu(tmp_path, 3), '"power"', '"temperature"', more, engine=engine)
+    told = scheduled(load(path)).to_text()
+    assert "loop: hall on itself" in told
+    assert "algebraic loop, repeated until it settles: hall.net -> hall.power -> hall.net" in told
     made = run(load(path), tmp_path / "out", report=False)
     summary = made.summary
     assert summary["unsettled_steps"] == unsettled

@@ -113,9 +113,10 @@ class Schedule:
                 lines.append(f"  {edge.source} -> {edge.target}: {late}{more}")
             if len(self.edges) > EDGES:
                 lines.append(f"  and {len(self.edges) - EDGES} more (all with --json)")
-        lines += [f"loop: {_few(loop)} act on each other" for loop in self.loops]
+        for loop in self.loops:
+            lines.append(f"loop: {_few(loop)} {'act on each other' if loop[1:] else 'on itself'}")
         iterated = any(action.do == "restore" for action in self.actions)
-        how = "solved in every step" if iterated else "broken by what comes a step late"
+        how = "repeated until it settles" if iterated else "broken by what comes a step late"
         for loop in self.algebraic:
             lines.append(f"algebraic loop, {how}: {' -> '.join((*loop, loop[0]))}")
         return "\n".join(lines)
