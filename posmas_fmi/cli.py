@@ -148,7 +148,8 @@ def _run(arguments: argparse.Namespace) -> int:
         print(f"min state  {_number(summary['min_state'])}")
         if summary.get("replay_noise") is not None:
             print(f"replay     steps done again differ by {_number(summary['replay_noise'])}")
-        print(f"report     {folder / 'report.html'}")
+        page = folder / "report.html"  # none where [record] leaves out what it is made of
+        print(f"report     {page if page.is_file() else 'none'}")
     if summary["verdict"] == "failed":
         return 3
     if summary["verdict"] == "cancelled":

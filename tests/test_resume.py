@@ -187,6 +187,18 @@ def test_what_cannot_go_on(tmp_path: Path) -> None:
         run(made(tmp_path), out, report=False, resume=True)
 
 
+def test_the_variables_that_are_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that stands there twice is a mistake; no report is promised that there is not."""
+    with pytest.raises(InputError, match=r"variables\[1\]: 'u' is there already"):
+        made(tmp_path, '[record]\nvariables = ["u", "u"]\n')
+    path = made(tmp_path, '[record]\nvariables = ["u"]\n').path
+    main(["run", str(path), "--out", str(tmp_path / "out")])
+    assert "report     none" in capsys.readouterr().out
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
 def test_mistakes_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = scenario(tmp_path, "")
     assert main(["run", path, "--branch", str(tmp_path), "--out", str(tmp_path / "b")]) == 2

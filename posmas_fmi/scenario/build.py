@@ -324,6 +324,10 @@ class _Builder:
             self.problems.append(
                 ("$.record.every", f"expected a whole number >= 1 (got {record.every})")
             )
+        twice = [k for k, name in enumerate(record.variables) if name in record.variables[:k]]
+        for k in twice:
+            place = f"$.record.variables[{k}]"
+            self.problems.append((place, f"{record.variables[k]!r} is there already"))
         if self.tables.cooling is not None and record.every > 1:
             self.problems.append(
                 ("$.record.every", "expected 1: the KPIs of [cooling] need every point")
