@@ -98,6 +98,8 @@ def test_a_row_of_lines_shares_its_facility(folder: Path) -> None:
     assert result.summary["verdict"] in ("converged", "not converged")
     with xarray.open_dataset(folder / "out" / "results.nc") as data:
         assert data["heat_load"].dims == ("time", "agent")
+        # while it initialises, an FMU has the first values of its signals already
+        np.testing.assert_allclose(data["heat_load"][0], [80e3, 70e3, 90e3])
         # what an FMU shows at t was set for the step that ended there: 22 s is seen from 25 s on
         np.testing.assert_allclose(data["heat_load"][1], [80e3, 70e3, 90e3])
         np.testing.assert_allclose(data["heat_load"][5], [80e3, 70e3, 90e3])
@@ -107,6 +109,16 @@ def test_a_row_of_lines_shares_its_facility(folder: Path) -> None:
         np.testing.assert_array_equal(data["header"][1:, 0], header[:-1])
         np.testing.assert_array_equal(data["facility.kv[2]"][1:], kv[:-1, 1])
         assert np.ptp(header) > 1e-3
+
+
+def test_a_start_value_of_an_input_goes_before_its_signal(folder: Path) -> None:
+    import xarray
+
+    given = ('record = ["heat_load",', 'parameters = {heat_load = 50e3}\nrecord = ["heat_load",')
+    run(load(write(folder, given)), folder / "out", report=False)
+    with xarray.open_dataset(folder / "out" / "results.nc") as data:
+        np.testing.assert_allclose(data["heat_load"][0], 50e3)
+        np.testing.assert_allclose(data["heat_load"][1], [80e3, 70e3, 90e3])
 
 
 WRONG = {

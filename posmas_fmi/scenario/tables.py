@@ -221,8 +221,8 @@ class PlantTable:
         Start values by name. Those that the FMU does not let one set, or changes, are told and
         stand in ``manifest.json`` under ``start_values``.
     exogenous : table
-        FMU input = "name of a signal". It is set from the first communication step on; while the
-        FMU initialises, the input has its start value (`parameters`).
+        FMU input = "name of a signal". While the FMU initialises, the input has the first value
+        of the signal already, or its start value where `parameters` give one.
     measured : table
         What the controllers measure beside y, ``name = "signal"``, ``"VARIABLE"`` of the agent's
         FMU or ``"component.VARIABLE"``; which names there are, the control law says.

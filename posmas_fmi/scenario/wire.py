@@ -40,6 +40,9 @@ class Instance:
         Derivatives of some of these.
     more : list of str
         FMU variables that are read besides.
+    first : dict of str to float
+        What inputs that follow signals alone are when the run begins: also while the FMU
+        initialises, unless `values` has something else.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Instance:
     extras: dict[str, Extra] = attrs.field(factory=dict)
     rates: dict[str, Extra] = attrs.field(factory=dict)
     more: list[str] = attrs.field(factory=list)
+    first: dict[str, float] = attrs.field(factory=dict)
 
     def check(self, variable: str, place: str) -> None:
         """Refuse what is no single number of the FMU.
@@ -110,9 +114,10 @@ class Instance:
 
     def spec(self) -> PlantSpec:
         """Return the definition of the instance."""
+        first = {name: v for name, v in self.first.items() if not self._has_start(name)}
         return PlantSpec(
             self.about.path,
-            self.values,
+            {**first, **self.values},
             self.name,
             attrs.evolve(
                 converted(self.about, self.inputs) + PortMap.plain(tuple(self.extras)),
@@ -121,6 +126,10 @@ class Instance:
             converted(self.about, self.readings) + PortMap.plain(tuple(self.more)),
             self.tolerance,
         )
+
+    def _has_start(self, variable: str) -> bool:
+        """Whether a start value is given for a variable, or for the array that it is part of."""
+        return variable in self.values or variable.partition("[")[0] in self.values
 
 
 @attrs.frozen(eq=False)
@@ -401,7 +410,12 @@ class Wires:
         def place(source: _Reading | int) -> int:
             return source if isinstance(source, int) else int(at[source.instance] + local[source])
 
+        drive = NoDrive() if signals is None else signals
+        at_first = drive.rows(0, 1)[0]
         for instance, variable, terms, bias, where in self._terms:
+            if all(isinstance(s, int) for s, _ in terms):
+                value = bias + sum(w * at_first[-1 - place(s)] for s, w in terms)
+                self._all[instance].first[variable] = float(value)
             rate = self._with_rate.get((instance, variable))
             extra = Extra(tuple(Term(place(s), w) for s, w in terms), bias, has_rate=bool(rate))
             self._all[instance].feed(variable, extra, where)
@@ -409,13 +423,13 @@ class Wires:
                 rates = tuple(Term(place(s), w) for s, w in rate)
                 self._all[instance].rates[variable] = Extra(rates, is_rate=True)
         if signals is not None and self._rates:
-            signals = attrs.evolve(signals, rates=tuple(self._rates))
+            drive = attrs.evolve(signals, rates=tuple(self._rates))
         measured = [[place(source) for source in ends] for ends in self._measured]
         wiring = Wiring(
             tuple((*one.extras.values(), *one.rates.values()) for one in self._all),
             np.array(measured, dtype=np.int64).reshape(len(measured), n).T,
             tuple(place(reading) for reading in recorded),
-            NoDrive() if signals is None else signals,
+            drive,
         )
         of_agents = {
             _label(f"agents.{name}" if name in TAKEN else name): tuple(range(k * n, (k + 1) * n))
