@@ -241,7 +241,9 @@ def _values(variable: Any, rows: Rows) -> Array | tuple[str, ...] | None:
         return _unpacked(variable, variable[...])
     if kind == "text" and len(variable.dimensions) == 1:
         found = np.asarray(variable[...], dtype=object).tolist()
-        return tuple(map(_text, found))
+        return tuple(
+            t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t) for t in found
+        )
     return None
 
 
