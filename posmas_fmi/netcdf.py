@@ -241,9 +241,7 @@ def _values(variable: Any, rows: Rows) -> Array | tuple[str, ...] | None:
         return _unpacked(variable, variable[...])
     if kind == "text" and len(variable.dimensions) == 1:
         found = np.asarray(variable[...], dtype=object).tolist()
-        return tuple(
-            t.decode("utf-8", "replace") if isinstance(t, bytes) else str(t) for t in found
-        )
+        return tuple(map(_text, found))
     return None
 
 

@@ -18,10 +18,10 @@ from posmas_fmi.fmu.check.binaries import binary_findings, read_binaries
 from posmas_fmi.fmu.check.described import read_description
 from posmas_fmi.fmu.check.description import description_findings, strict_findings
 from posmas_fmi.fmu.check.finding import worst
-from posmas_fmi.fmu.check.image import ImageError, read_image
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.xml import MAX_DEPTH, scan
 from posmas_fmi.fmu.compile import host
+from posmas_fmi.fmu.image import ImageError, read_image
 
 Entry = tuple[zipfile.ZipInfo | str, bytes]
 

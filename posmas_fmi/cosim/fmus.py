@@ -251,7 +251,7 @@ class NativeMessages:
 
 
 def _leave(library: ctypes.CDLL, senders: dict[int, _Sender]) -> None:
-    for sender in senders.values():
+    for sender in reversed(senders.values()):  # the last that came is found at once
         library.message_log_leave(ctypes.addressof(sender))
 
 

@@ -291,20 +291,19 @@ def load_class(text: str, folder: Path) -> Callable[..., Any]:
     InputError
         If there is no such file or class, or the file cannot be run.
     """
-    place = PLACE
     file, colon, name = text.rpartition(":")
     path = folder / file
     if not colon or not path.is_file():
-        raise InputError(f'expected "file.py:Class" beside the scenario (got {text!r})', place)
+        raise InputError(f'expected "file.py:Class" beside the scenario (got {text!r})', PLACE)
     spec = importlib.util.spec_from_file_location(f"posmas_fmi_user_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise InputError(f"expected a Python file (got {file!r})", place)
+        raise InputError(f"expected a Python file (got {file!r})", PLACE)
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{file} cannot be run: {_said(error)}", place) from error
+        raise InputError(f"{file} cannot be run: {_said(error)}", PLACE) from error
     found = getattr(module, name, None)
     if not callable(found):
-        raise InputError(f"{file} has no class {name!r}", place)
+        raise InputError(f"{file} has no class {name!r}", PLACE)
     return found  # type: ignore[no-any-return]

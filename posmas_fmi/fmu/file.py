@@ -15,7 +15,7 @@ from posmas_fmi.fmu.about import About, Kind, read_description
 from posmas_fmi.fmu.archive import is_file_name, unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
-from posmas_fmi.fmu.check.image import ImageError, read_image
+from posmas_fmi.fmu.image import ImageError, read_image
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
 from posmas_fmi.fmu.scratch import Scratch

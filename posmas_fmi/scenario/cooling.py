@@ -27,7 +27,6 @@ from posmas_fmi.design import Design
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.network import Network
-from posmas_fmi.scenario.coverage import not_about
 from posmas_fmi.scenario.signals import Signal, read_signal
 from posmas_fmi.scenario.tables import (
     AgentTable,
@@ -37,7 +36,7 @@ from posmas_fmi.scenario.tables import (
     ScenarioTable,
     SignalTable,
 )
-from posmas_fmi.scenario.verdict import overall
+from posmas_fmi.scenario.verdict import not_about, overall
 
 if TYPE_CHECKING:
     from posmas_fmi.scenario.build import Scenario

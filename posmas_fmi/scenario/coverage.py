@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from posmas_fmi.design import Design
+from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.tables import ArcTable, ChannelTable
-
-if TYPE_CHECKING:
-    from posmas_fmi.scenario.build import Scenario
-
-
-def not_about(law: str) -> dict[str, Any]:
-    """Return what design.json says where the certificate is not about the law that runs."""
-    return {
-        "certified": "no",
-        "conditions": [],
-        "covers": [],
-        "rate": None,
-        "observer_rate": None,
-        "rate_perron": None,
-        "positive": False,
-        "notes": [f"The certificate of the design is not about {law}"],
-    }
 
 
 def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:

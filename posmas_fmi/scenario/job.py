@@ -34,13 +34,13 @@ from posmas_fmi.fmu.start_values import told as start_value
 from posmas_fmi.network import Network
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.build import Scenario, make_channel
-from posmas_fmi.scenario.coverage import coverage, not_about
+from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.folder import occupied
-from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, parameters
+from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, parameters, periods
 from posmas_fmi.scenario.resume import Beginning, branched, forget_snapshots, resumed, snapshots
 from posmas_fmi.scenario.schedule import Schedule, make_schedule, schedule_of
-from posmas_fmi.scenario.verdict import summarise
+from posmas_fmi.scenario.verdict import not_about, summarise
 from posmas_fmi.writing import whole
 
 log = logging.getLogger(__name__)
@@ -253,9 +253,7 @@ def _run_in(
             list(scenario.faults),
             designed.network,
             scenario.clock,
-            bool(designed.certificate.delays)
-            and facts["certified"] != "no"
-            and scenario.control.python is None,
+            bool(designed.certificate.delays) and facts["certified"] != "no",
         )
     if baseline is not None:
         without = summarise(baseline, scenario.network.names, scenario.settings.tolerance)
@@ -374,9 +372,7 @@ def _own_law(scenario: Scenario, designed: Design) -> Law:
         if hasattr(found, "step_all")
         else [make(found, k + 1, **given) for k in range(N)]
     )
-    every = [1] * N
-    for override in scenario.plant.override:
-        every[override.agent - 1] = override.every
+    every = periods(scenario)[:N].tolist()
     return PythonLaw(scenario.agent, designed.network, controllers, every, scenario.clock)
 
 

@@ -158,7 +158,7 @@ def make_instances(
                     "all instances of a file; use a copy of the file for those that are different",
                     _place(scenario, k if name in given else first[path], name),
                 )
-    every = _periods(scenario)
+    every = periods(scenario)
     _check_periods(scenario, [abouts[path] for path in files], every)
     shows_states = _shows_states(scenario)
     agents = [
@@ -248,7 +248,7 @@ def _override(scenario: Scenario, k: int) -> tuple[int, Override] | None:
     return found[-1] if found else None
 
 
-def _periods(scenario: Scenario) -> Whole:
+def periods(scenario: Scenario) -> Whole:
     """Period of each instance in communication steps."""
     every = np.ones(scenario.network.N + len(scenario.components), dtype=np.int64)
     for k, override in enumerate(scenario.plant.override):

@@ -12,6 +12,20 @@ from posmas_fmi.cosim.master import Outcome
 NEGATIVE = -1e-9  # a state above this counts as non-negative: the noise of the integration
 
 
+def not_about(law: str) -> dict[str, Any]:
+    """Return what design.json says where the certificate is not about the law that runs."""
+    return {
+        "certified": "no",
+        "conditions": [],
+        "covers": [],
+        "rate": None,
+        "observer_rate": None,
+        "rate_perron": None,
+        "positive": False,
+        "notes": [f"The certificate of the design is not about {law}"],
+    }
+
+
 def summarise(
     outcome: Outcome,
     names: tuple[str, ...],

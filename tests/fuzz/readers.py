@@ -21,10 +21,10 @@ from posmas_fmi.expression import parse
 from posmas_fmi.fmu.check.described import read_description
 from posmas_fmi.fmu.check.description import description_findings
 from posmas_fmi.fmu.check.finding import worst
-from posmas_fmi.fmu.check.image import ImageError, read_image
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.check.xml import scan
 from posmas_fmi.fmu.compare import read_reference
+from posmas_fmi.fmu.image import ImageError, read_image
 from posmas_fmi.network_file import read_adjacency
 from posmas_fmi.report.json_files import design_facts, read_json, summary_facts
 from posmas_fmi.scenario import load

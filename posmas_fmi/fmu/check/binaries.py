@@ -12,8 +12,8 @@ from posmas_fmi.errors import ArchiveError, BuildError
 from posmas_fmi.fmu.archive import entry_names, read_entry
 from posmas_fmi.fmu.check.described import Description
 from posmas_fmi.fmu.check.finding import Finding
-from posmas_fmi.fmu.check.image import Image, ImageError, read_image
 from posmas_fmi.fmu.compile import host
+from posmas_fmi.fmu.image import Image, ImageError, read_image
 
 _SYSTEMS = {"linux": "linux", "win": "windows", "darwin": "darwin"}
 _EXTENSIONS = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}

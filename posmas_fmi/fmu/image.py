@@ -62,7 +62,7 @@ def read_image(data: bytes) -> Image:
     >>> read_image(b"MZ")
     Traceback (most recent call last):
         ...
-    posmas_fmi.fmu.check.image.ImageError: the file is cut off or damaged
+    posmas_fmi.fmu.image.ImageError: the file is cut off or damaged
     """
     try:
         if data[:4] == b"\x7fELF":
