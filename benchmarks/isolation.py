@@ -8,6 +8,10 @@ tests/faulty.c without a fault, whose steps cost nothing, or about 100 microseco
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # idle BLAS threads spin on a processor
+
 import argparse
 import sys
 import tempfile

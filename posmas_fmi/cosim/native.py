@@ -32,6 +32,7 @@ _HERE = Path(__file__).parent / "csrc"
 _EXPORT = Path(resources.__file__).parent / "fmu" / "csrc" / "export.h"
 _FMUS = ("fmus.h", "fmus.c", "message_log.h", "message_log.c")
 _ENGINE = ("engine.h", "engine.c", "threads.h", "threads.c", "controllers.c", "lanes.h")
+_WAITING = ("waiting.h", "waiting.c")
 _SURROUNDINGS = ("surroundings.h", "surroundings.c")
 _MORE_FLAGS = ("-O3", "-pthread")  # of the engine: unrolls the small matrix products
 
@@ -77,7 +78,8 @@ def fmus_sources() -> Sources:
 def worker_sources() -> Sources:
     """Return the sources of the loop over FMUs in worker processes, for both sides of it."""
     return Sources(
-        "worker", _read((*_FMUS, "remote.h", "remote.c", "worker_loop.c", *_SURROUNDINGS))
+        "worker",
+        _read((*_FMUS, "remote.h", "remote.c", "worker_loop.c", *_WAITING, *_SURROUNDINGS)),
     )
 
 

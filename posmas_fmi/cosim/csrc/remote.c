@@ -11,6 +11,7 @@
 #include <time.h>
 
 #include "export.h"
+#include "waiting.h"
 
 enum { NAP = 20000000, DYING = 100 }; /* ns between two looks at a worker; looks */
 
@@ -114,6 +115,18 @@ static void kill_worker(Worker *w)
         nanosleep(&(struct timespec){0, NAP / 2}, NULL);
 }
 
+/* Look for a while whether the order of x is done. */
+static int is_done_soon(Workers *r, const RemoteInstance *x)
+{
+    const int64_t until = clock_now() + r->looks;
+    do {
+        if (__atomic_load_n(&x->slot->done, __ATOMIC_ACQUIRE) == x->slot->posted)
+            return 1;
+        look_away();
+    } while (clock_now() < until);
+    return 0;
+}
+
 /* What keeps the order of x from being done: CALL_NONE when it is done. */
 static int64_t await(Workers *r, RemoteInstance *x)
 {
@@ -121,11 +134,8 @@ static int64_t await(Workers *r, RemoteInstance *x)
     Head *head = w->head;
     const int64_t posted = x->slot->posted;
     const int64_t *done = &x->slot->done;
-    for (int64_t n = 0; n < r->spins; n++) {
-        if (__atomic_load_n(done, __ATOMIC_ACQUIRE) == posted)
-            return CALL_NONE;
-        pause_briefly();
-    }
+    if (is_done_soon(r, x))
+        return CALL_NONE;
     int64_t begun = -1;
     double since = 0;
     for (;;) {

@@ -1,7 +1,7 @@
-/* FMUs in worker processes: what a master and a worker share, and how they wake each other.
+/* FMUs in worker processes: what a master and a worker share.
  *
- * Posted work and answers are counters in shared memory; a process that waits spins for a while and
- * then sleeps on a counter of the other one. Every member has 8 bytes or comes in a pair of 4. */
+ * Posted work and answers are counters in shared memory; a process waits for one of the other's, see
+ * waiting.h. Every member has 8 bytes or comes in a pair of 4. */
 #ifndef REMOTE_H
 #define REMOTE_H
 
@@ -74,7 +74,7 @@ typedef struct {
     int64_t n_workers;
     RemoteInstance *instances;
     double deadline;    /* [s] for one call */
-    int64_t spins;
+    int64_t looks;      /* [ns] how long it looks before it sleeps */
     /* Called when an instance failed, or its worker ended, with the incident in the instance: brings
      * back what can be, gives up the rest, and returns whether to look again. NULL: it is final. */
     int (*recover)(int64_t instance);
@@ -90,24 +90,8 @@ typedef struct {
     const Fmus *fmus;
     Slot *const *slots;  /* of each instance */
     double *scratch;
-    int64_t spins;
+    int64_t looks;       /* [ns] how long it looks before it sleeps */
     int64_t answered;    /* requests answered so far */
 } WorkerLoop;
-
-/* ---- waking each other ----------------------------------------------------------------------- */
-
-/* Sleep while *word is `seen`, for at most so long; may return early. */
-void word_wait(uint32_t *word, uint32_t seen, int64_t nanoseconds);
-/* Wake all that sleep on it. */
-void word_wake(uint32_t *word);
-
-static inline void pause_briefly(void)
-{
-#if defined __x86_64__ || defined __i386__
-    __asm__ __volatile__("pause");
-#elif defined __aarch64__
-    __asm__ __volatile__("yield");
-#endif
-}
 
 #endif

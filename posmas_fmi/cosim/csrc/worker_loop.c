@@ -1,46 +1,9 @@
 /* The loop of a worker process: do what is posted, until there is a request for Python. */
-#define _GNU_SOURCE
 #include "remote.h"
-
-#include <time.h>
 
 #include "export.h"
 #include "surroundings.h"
-
-#if defined __linux__
-#include <linux/futex.h>
-#include <sys/syscall.h>
-#include <unistd.h>
-
-void word_wait(uint32_t *word, uint32_t seen, int64_t nanoseconds)
-{
-    const struct timespec most = {nanoseconds / 1000000000, nanoseconds % 1000000000};
-    syscall(SYS_futex, word, FUTEX_WAIT, seen, &most, NULL, 0);
-}
-
-void word_wake(uint32_t *word)
-{
-    syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
-}
-
-#else
-
-void word_wait(uint32_t *word, uint32_t seen, int64_t nanoseconds)
-{
-    for (int64_t nap = 20000; nanoseconds > 0; nanoseconds -= nap) {
-        if (__atomic_load_n(word, __ATOMIC_SEQ_CST) != seen)
-            return;
-        nanosleep(&(struct timespec){0, nap}, NULL);
-        if (nap < 1000000)
-            nap *= 2;
-    }
-}
-
-void word_wake(uint32_t *word)
-{
-    (void)word; /* it looks */
-}
-#endif
+#include "waiting.h"
 
 enum { NAP = 200000000 }; /* ns; whoever rings wakes it before */
 
@@ -62,6 +25,18 @@ static void do_order(const WorkerLoop *w, int64_t i, int64_t order)
     w->head->calling.call = CALL_NONE;
     s->report = report;
     __atomic_store_n(&s->done, order, __ATOMIC_RELEASE);
+}
+
+/* Look for a while whether the bell, last seen so, has been rung. */
+static int is_rung(const WorkerLoop *w, uint32_t seen)
+{
+    const int64_t until = clock_now() + w->looks;
+    do {
+        if (__atomic_load_n(&w->head->bell, __ATOMIC_ACQUIRE) != seen)
+            return 1;
+        look_away();
+    } while (clock_now() < until);
+    return 0;
 }
 
 EXPORT void worker_run(WorkerLoop *w)
@@ -88,11 +63,8 @@ EXPORT void worker_run(WorkerLoop *w)
         /* a request may be read before it is counted here */
         if (__atomic_load_n(&head->asked, __ATOMIC_SEQ_CST) > w->answered)
             return;
-        for (int64_t n = 0; n < w->spins; n++) {
-            if (__atomic_load_n(&head->bell, __ATOMIC_ACQUIRE) != bell)
-                break;
-            pause_briefly();
-        }
+        if (is_rung(w, bell))
+            continue;
         __atomic_store_n(&head->asleep, 1, __ATOMIC_SEQ_CST);
         __atomic_thread_fence(__ATOMIC_SEQ_CST);
         if (__atomic_load_n(&head->bell, __ATOMIC_SEQ_CST) == bell)

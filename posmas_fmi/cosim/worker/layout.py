@@ -113,7 +113,7 @@ class Workers(ctypes.Structure):
         ("n_workers", _int),
         ("instances", _pointer),
         ("deadline", _double),
-        ("spins", _int),
+        ("looks", _int),
         ("recover", Recover),
         ("interrupted", Interrupted),
         ("recovering", _int),
@@ -134,7 +134,7 @@ class WorkerLoop(ctypes.Structure):
         ("fmus", _pointer),
         ("slots", _pointer),
         ("scratch", _pointer),
-        ("spins", _int),
+        ("looks", _int),
         ("answered", _int),
     )
 

@@ -16,8 +16,9 @@ from posmas_fmi.cosim.worker.proxy import RemoteFile, built_here
 
 OnFailure = Literal["stop", "freeze", "restart"]
 
-# Looks before sleeping; with few processors they cost more than they save.
-SPINS = 0
+# Looking before sleeping [s], where workers leave a processor to the master, and where they do not:
+# a processor that sleeps takes longer to wake than a short step; but who looks keeps one busy.
+AMPLE, SHORT = 200e-6, 50e-6
 
 
 @attrs.frozen
@@ -65,8 +66,8 @@ class WorkerPool:
 
     Attributes
     ----------
-    spins : int
-        How often master and workers look before they sleep; 0 where processors are short.
+    looks : float
+        How long master and workers look for what they wait for before they sleep [s].
     leftovers : list of Leftover
         Of each process that was started.
     """
@@ -76,7 +77,7 @@ class WorkerPool:
         self._isolation = isolation
         cores = processors()
         self._most = max(1, min(isolation.workers or cores, instances))
-        self.spins = SPINS if cores > 1 else 0
+        self.looks = AMPLE if self._most < cores else SHORT
         self._shared: list[WorkerProcess] = []
         self._all: list[WorkerProcess] = []
         self._next = 0
@@ -86,7 +87,7 @@ class WorkerPool:
 
     def start(self) -> WorkerProcess:
         """Start one more process."""
-        worker = WorkerProcess(self._isolation.limits, self._isolation.patience, self.spins)
+        worker = WorkerProcess(self._isolation.limits, self._isolation.patience, self.looks)
         self._all.append(worker)
         self.leftovers.append(worker.leftover)
         return worker

@@ -101,8 +101,8 @@ class WorkerProcess:
     ----------
     limits : Limits
     patience : Patience
-    spins : int
-        How often it looks for work before it sleeps.
+    looks : float
+        How long it looks for work before it sleeps [s].
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class WorkerProcess:
         What its FMUs left behind; complete when it is closed.
     """
 
-    def __init__(self, limits: Limits, patience: Patience, spins: int) -> None:
+    def __init__(self, limits: Limits, patience: Patience, looks: float) -> None:
         path = native.library(native.worker_sources())
         self._library = native.load(path)
         layout.check(self._library)
@@ -132,7 +132,7 @@ class WorkerProcess:
             str(scratch.folder),
             str(path),
             attrs.asdict(limits),
-            spins,
+            looks,
         )
         try:
             with theirs:

@@ -115,7 +115,7 @@ class Remote:
             len(self._workers),
             ctypes.addressof(self._entries),
             isolation.patience.step,
-            pool.spins,
+            int(1e9 * pool.looks),
             self._recover,
             self._look,
         )

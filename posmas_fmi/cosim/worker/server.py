@@ -38,7 +38,7 @@ class Settings:
     folder: str
     library: str
     limits: dict[str, Any]
-    spins: int
+    looks: float
 
     def text(self) -> str:
         """As an argument of the process."""
@@ -87,7 +87,8 @@ class Server:
         self._instances: dict[int, FmuInstance] = {}
         self._kept: dict[int, FmuState] = {}
         self._loop = layout.WorkerLoop(
-            ctypes.addressof(memory.head), None, None, None, settings.spins, 0
+            *(ctypes.addressof(memory.head), None, None, None),
+            *(int(1e9 * settings.looks), 0),
         )
         self._keep: list[Any] = []  # what the loop points to
         self._said: list[str] = []
