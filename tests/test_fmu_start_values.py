@@ -14,9 +14,10 @@ from fmu_examples import example_1, tank_fmu
 from fmu_scenarios import one_fmu
 
 from posmas_fmi import load, run
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import FmuError, InputError
+from posmas_fmi.fmu import start_values
 from posmas_fmi.fmu.file import FmuFile
-from posmas_fmi.fmu.start_values import read_back, settable
+from posmas_fmi.fmu.start_values import StartValues, read_back, settable, spread
 from posmas_fmi.scenario.job import scheduled
 
 PUMP = """
@@ -133,6 +134,51 @@ def test_arrays_are_start_values(tmp_path: Path) -> None:
         kept, refused = settable(file.about, values)
         instance.initialise(kept)
         assert (list(kept), refused, read_back(instance, kept)) == (list(values), [], [])
+
+
+def test_values_of_the_same_names_and_shapes_are_checked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thousand instances of one FMU start in a tenth of a second (benchmarks/engine.py)."""
+    example, checked = example_1(), []
+    monkeypatch.setattr(
+        start_values, "spread", lambda *given: checked.append(given) or spread(*given)
+    )
+    with FmuFile(example.fmu(2, tmp_path)) as file:  # FMI 2: a scalar for each element
+        start = StartValues(file)
+        for k in range(5):
+            values = {**example.matrices, "x": np.array([1.0, 0.1 * k])}
+            with file.instantiate(f"{k}") as instance:
+                given, refused = start.of(values, instance.name)
+                instance.initialise(given)
+                assert (refused, read_back(instance, given)) == ([], [])
+                assert [instance.get(f"x[{i}]") for i in (1, 2)] == [1.0, 0.1 * k]
+                assert instance.get("A[2,1]") == example.A[1, 0]
+        once = len(checked)
+        start.of({**values, "x": np.array([2.0, 3.0])}, "again")
+        assert len(checked) == once
+        with pytest.raises(InputError, match=r"no variable 'x\[3\]'"):
+            start.of({"x": np.ones(3)}, "three")
+
+
+def test_findings_are_about_their_own_instance(pump: Path) -> None:
+    with FmuFile(pump) as file:
+        start = StartValues(file)
+        for name in ("a", "b"):
+            given, refused = start.of(VALUES, name)
+            assert {f.instance for f in refused} == {name}
+            assert dict(given) == {"limit": [12.0], "u": [0.1], "label": "long name"}
+
+
+def test_values_of_another_file_are_resolved_anew(tmp_path: Path) -> None:
+    tank = tank_fmu(tmp_path, 3)
+    with FmuFile(tank) as one, FmuFile(example_1().fmu(3, tmp_path)) as other:
+        given = one.given({"loss": 2.0})
+        assert one.given(given) is given
+        with pytest.raises(FmuError, match="no variable 'loss'"):
+            other.given(given)
+        with pytest.raises(InputError, match="expected numbers for 'loss'"):
+            one.given({"loss": {"a": 1}})
 
 
 @pytest.mark.parametrize(

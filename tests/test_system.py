@@ -124,6 +124,10 @@ def system(observer: str = "local", **changes: Any) -> System:
 
 
 def plant(fmu: Path) -> FmuPlant:
+    return FmuPlant(plant_specs(fmu), True, 1e9)
+
+
+def plant_specs(fmu: Path) -> list[PlantSpec]:
     agents = [
         PlantSpec(
             fmu,
@@ -135,7 +139,7 @@ def plant(fmu: Path) -> FmuPlant:
         for i in range(N)
     ]
     shared = PlantSpec(fmu, {}, "shared", PortMap.plain(("u", "d")), PortMap.plain(("y[1]",)))
-    return FmuPlant([*agents, shared], True, 1e9)
+    return [*agents, shared]
 
 
 def run(
@@ -375,8 +379,7 @@ def test_a_coupled_pair_against_its_analytic_solution(
 
 def test_a_failing_instance_can_be_frozen(fmu: Path) -> None:
     definition = system()
-    specs = list(plant_specs(fmu))
-    with FmuPlant(specs, True, 1e9) as plants:
+    with plant(fmu) as plants:
         library = engine.native.load(engine.choose(definition.law, "c").library)
         one = engine.Engine(definition, plants, library, 1, ("x", "u"))
         one.freeze_failures()
@@ -396,8 +399,3 @@ def test_a_failing_instance_can_be_frozen(fmu: Path) -> None:
     last = int(np.flatnonzero(np.diff(x[:, 2]))[-1]) + 1
     assert 20 <= last < 60
     assert (np.diff(x[last:, 0]) != 0).all()
-
-
-def plant_specs(fmu: Path) -> tuple[PlantSpec, ...]:
-    with plant(fmu) as made:
-        return made._specs

@@ -39,10 +39,9 @@ from posmas_fmi.fmu.model import element_names
 from posmas_fmi.fmu.open import open_fmu
 from posmas_fmi.fmu.start_values import (
     StartFinding,
+    StartValues,
     grouped,
     read_back,
-    settable,
-    spread,
     told,
 )
 from posmas_fmi.fmu.units import Conversion
@@ -152,26 +151,15 @@ class FmuPlant:
                     (spec.fmu, ports) for spec in specs for ports in (spec.inputs, spec.readings)
                 )
             }
-            specs = self._specs = tuple(
-                attrs.evolve(
-                    spec,
-                    inputs=known[spec.fmu, spec.inputs],
-                    readings=known[spec.fmu, spec.readings],
-                )
-                for spec in specs
-            )
+            self._inputs = [known[spec.fmu, spec.inputs] for spec in specs]
+            self._readings = [known[spec.fmu, spec.readings] for spec in specs]
             findings: list[StartFinding] = []
             of_each = [files[spec.fmu] for spec in specs]
             self._instances = _start_all(of_each, specs, stop, findings, stack)
             self.start_values = tuple(findings)
             for finding in () if quiet else grouped(findings):
                 log.warning("%s", told(finding))
-            self.fmus = Fmus(
-                self._instances,
-                [spec.inputs for spec in specs],
-                [spec.readings for spec in specs],
-                messages,
-            )
+            self.fmus = Fmus(self._instances, self._inputs, self._readings, messages)
             self._remote = self._connect(isolation, pool, stack)
             self._release = stack.pop_all()
         self._pool = pool
@@ -189,9 +177,9 @@ class FmuPlant:
         """Let the loops find the instances that are in worker processes."""
         if not any(isinstance(one, RemoteInstance) for one in self._instances):
             return None
-        inputs = [spec.inputs for spec in self._specs]
-        readings = [spec.readings for spec in self._specs]
-        remote = Remote(self._instances, inputs, readings, pool, isolation, self.fmus.failures)
+        remote = Remote(
+            self._instances, self._inputs, self._readings, pool, isolation, self.fmus.failures
+        )
         stack.enter_context(closing(remote))
         self.fmus.use(remote)
         return remote
@@ -250,7 +238,7 @@ class FmuPlant:
             self._freeze(time, time, readings, before)
             return
         for number in which:
-            instance, ports = self._instances[number], self._specs[number].readings
+            instance, ports = self._instances[number], self._readings[number]
             values = instance.read(instance.file.ports(ports.variables))
             at = slice(self.reading_at[number], self.reading_at[number + 1])
             readings[at] = (values - np.array(ports.offset)) / np.array(ports.scale)
@@ -265,7 +253,7 @@ class FmuPlant:
             self._freeze(float(t[0]), float(t[0] + h[0]), readings, before)
             return
         for number, begin, length in zip(which, t, h, strict=True):
-            instance, ports = self._instances[number], self._specs[number].inputs
+            instance, ports = self._instances[number], self._inputs[number]
             at = slice(self.input_at[number], self.input_at[number + 1])
             given, rates = np.split(inputs[at], [len(ports.variables)])
             values = given * np.array(ports.scale) + np.array(ports.offset)
@@ -416,6 +404,7 @@ def _start_all(
     """Make and initialise all instances; worker processes do it side by side."""
     instances: list[FmuInstance] = []
     told: dict[FmuInstance, list[StartFinding]] = {}
+    start = {file: StartValues(file) for file in dict.fromkeys(files)}
     there: dict[WorkerProcess, list[tuple[RemoteInstance, PlantSpec]]] = {}
     for file, spec in zip(files, specs, strict=True):
         if isinstance(file, RemoteFile):
@@ -424,13 +413,13 @@ def _start_all(
             there.setdefault(instance.worker, []).append((instance, spec))
         else:
             instance = stack.enter_context(file.instantiate(spec.name))
-            told[instance] = _initialise(instance, spec, stop)
+            told[instance] = _initialise(instance, spec, start[file], stop)
         instances.append(instance)
 
     def make(worker: WorkerProcess) -> None:
         for one, spec in there[worker]:
             one.make(worker)
-            told[one] = _initialise(one, spec, stop)
+            told[one] = _initialise(one, spec, start[one.file], stop)
 
     with ThreadPoolExecutor(max(len(there), 1)) as threads:
         made = [threads.submit(make, worker) for worker in there]
@@ -449,9 +438,10 @@ def _start_all(
     return instances
 
 
-def _initialise(instance: FmuInstance, spec: PlantSpec, stop: float) -> list[StartFinding]:
-    about = instance.file.about
-    values, refused = settable(about, spread(about, spec.values), spec.name)
+def _initialise(
+    instance: FmuInstance, spec: PlantSpec, start: StartValues, stop: float
+) -> list[StartFinding]:
+    values, refused = start.of(spec.values, spec.name)
     instance.initialise(values, stop=stop, tolerance=spec.tolerance)
     return [*refused, *read_back(instance, values)]
 
@@ -465,6 +455,8 @@ def structure_of(path: Path, specs: Sequence[PlantSpec]) -> Mapping[str, int]:
         If instances differ in one: then arrays of theirs have different lengths.
     """
     about = read_about(path)
+    if not about.structural:
+        return {}
     found: dict[tuple[tuple[str, int], ...], str] = {}
     for spec in specs:
         if spec.fmu == path:

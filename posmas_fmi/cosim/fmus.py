@@ -29,7 +29,7 @@ _int, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 Whole = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
-@attrs.frozen
+@attrs.frozen(cache_hash=True)  # of many instances, one map
 class PortMap:
     """Which FMU variables carry a protocol vector: FMU value = scale × value + offset.
 
@@ -211,6 +211,10 @@ class NativeMessages:
             getattr(library, name).restype = None
         weakref.finalize(self, _leave, library, self._senders)
         self._begin: dict[int, int] = {}
+        self._loggers = {
+            version: int(ctypes.cast(function, _pointer).value or 0)
+            for version, function in ((2, library.message_log_fmi2), (3, library.message_log_fmi3))
+        }
 
     @property
     def address(self) -> int:
@@ -219,8 +223,7 @@ class NativeMessages:
 
     def logger(self, version: int) -> int:
         """Address of the function that FMUs of this FMI version call."""
-        function = getattr(self._library, f"message_log_fmi{version}")
-        return int(ctypes.cast(function, _pointer).value or 0)
+        return self._loggers[version]
 
     def environment(self, key: int) -> int:
         """Return what the instance gives to that function."""

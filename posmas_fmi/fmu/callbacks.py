@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections import deque
 from collections.abc import Iterable
+from functools import cache
 from typing import Any, Protocol
 
 _KEPT_MESSAGES = 20
@@ -66,9 +67,7 @@ class PythonMessages:
 def callbacks_for(version: int, messages: Messages, key: int) -> Any:
     """Return what an instance gets to call back; none of it goes through Python by itself."""
     if version == 3:
-        from fmpy.fmi3 import fmi3LogMessageCallback
-
-        return fmi3LogMessageCallback(messages.logger(3))
+        return _callback_fmi3(messages.logger(3))
     if version == 1:
         return _callbacks_fmi1(messages, key)
 
@@ -88,6 +87,13 @@ def callbacks_for(version: int, messages: Messages, key: int) -> Any:
     return functions
 
 
+@cache
+def _callback_fmi3(logger: int) -> Any:
+    from fmpy.fmi3 import fmi3LogMessageCallback
+
+    return fmi3LogMessageCallback(logger)
+
+
 def _callbacks_fmi1(messages: Messages, key: int) -> Any:
     """Callbacks of FMI 1.0, where the logger is not given back what tells the instances apart."""
     from fmpy import calloc, free
@@ -97,9 +103,8 @@ def _callbacks_fmi1(messages: Messages, key: int) -> Any:
         fmi1CallbackFunctions,
         fmi1CallbackLoggerTYPE,
     )
-    from fmpy.fmi3 import fmi3LogMessageCallback
 
-    keep = fmi3LogMessageCallback(messages.logger(3))
+    keep = _callback_fmi3(messages.logger(3))
     environment = messages.environment(key)
 
     def log(_: Any, __: Any, status: int, category: bytes | None, text: bytes | None) -> None:

@@ -15,6 +15,7 @@ from posmas_fmi.fmu.about import About, Kind, read_description
 from posmas_fmi.fmu.archive import is_file_name, unpack
 from posmas_fmi.fmu.binding import Binding, Trace
 from posmas_fmi.fmu.callbacks import Messages, PythonMessages, callbacks_for, said
+from posmas_fmi.fmu.given import Forms, Given
 from posmas_fmi.fmu.image import ImageError, read_image
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.live import KEYS, Frees, Live, release
@@ -116,6 +117,7 @@ class FmuFile:
         self.token = str(self.description.guid or "")
         self.variables = self.about.variables
         self._variables = self.about.names
+        self._forms = Forms(self._variables, self.version)
         self.folder = folder
         self._load(str(interface.modelIdentifier))
 
@@ -303,6 +305,10 @@ class FmuFile:
             If the units do not fit; see `posmas_fmi.fmu.units.Units.conversion`.
         """
         return self.about.conversion(name, unit)
+
+    def given(self, values: Mapping[str, Any]) -> Given:
+        """Resolve values by name for `FmuInstance.set`; see `Forms.given`."""
+        return self._forms.given(values)
 
     def ports(self, names: Iterable[str]) -> Ports:
         """Resolve names for `FmuInstance.read` and `write`; see `Variables.ports`."""

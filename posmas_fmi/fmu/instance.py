@@ -218,11 +218,11 @@ class FmuInstance:
         FmuError
             If a name is unknown or a shape wrong.
         """
-        values = values or {}
-        variable = self.file.variable
-        self.set(values)
+        given = self.file.given(values or {})
+        self.set(given)
         self.enter_initialization(start=start, stop=stop, tolerance=tolerance)
-        self.set({n: v for n, v in values.items() if variable(n).causality == "input"})
+        if given.inputs is not None:
+            self.set(given.inputs)
         self.exit_initialization()
 
     def configure(self, structure: Mapping[str, int]) -> None:
@@ -427,22 +427,14 @@ class FmuInstance:
         ------
         FmuError
             If a name is unknown or a shape wrong.
+        InputError
+            If a value is neither a text nor numbers.
         """
-        given: dict[str, Array] = {}  # those that are no texts, in few calls
-        for name, value in values.items():
-            variable, index = self.file._variables.resolve(name)
-            if variable.type == "String":
-                self._set_text(variable, value)
-                continue
-            array = np.asarray(value, dtype=float)
-            shape = () if index is not None else variable.shape
-            if array.shape != shape and array.shape != (math.prod(shape),):
-                raise FmuError(f"expected {name!r} of shape {shape} (got {array.shape})", self.name)
-            if variable.type in WHOLE and not (array == np.rint(array)).all():
-                raise FmuError(f"expected whole numbers for {name!r} (got {value!r})", self.name)
-            given[name] = array.reshape(-1)
-        if given:
-            self.write(self.file.ports(given), np.concatenate(list(given.values())))
+        given = self.file.given(values)
+        for name, text in given.texts.items():
+            self._set_text(given.form.texts[name], text)
+        if given.flat.size:
+            self.write(given.form.ports, given.flat)
 
     def _whole(self, variable: Variable) -> np.ndarray[Any, Any]:
         """Read integers without going through floats."""
@@ -457,10 +449,8 @@ class FmuInstance:
         self.call("GetString", (ctypes.c_uint * 1)(variable.reference), 1, found, *count)
         return (found[0] or b"").decode("utf-8", "replace")
 
-    def _set_text(self, variable: Variable, value: Any) -> None:
-        if not isinstance(value, str) or variable.size != 1:
-            raise FmuError(f"expected a text for {variable.name!r} (got {value!r})", self.name)
-        texts = (ctypes.c_char_p * 1)(value.encode())
+    def _set_text(self, variable: Variable, text: str) -> None:
+        texts = (ctypes.c_char_p * 1)(text.encode())
         count = (1,) if self.file.version == 3 else ()
         self.call("SetString", (ctypes.c_uint * 1)(variable.reference), 1, texts, *count)
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.fmu.about import About
+from posmas_fmi.fmu.file import FmuFile
+from posmas_fmi.fmu.given import Form, Given, Key, as_arrays
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import REAL, WHOLE, Variable
 
@@ -35,6 +37,75 @@ class StartFinding:
     variable: str
     what: str
     message: str
+
+
+class StartValues:
+    """Start values for instances of one file; those of the same names and shapes are checked once.
+
+    Parameters
+    ----------
+    file : FmuFile
+    """
+
+    def __init__(self, file: FmuFile) -> None:
+        self._file = file
+        self._known: dict[Key, _Chosen] = {}
+
+    def of(self, values: Mapping[str, Any], instance: str) -> tuple[Given, list[StartFinding]]:
+        """Return the values that may be set before initialisation, and findings about the others.
+
+        Parameters
+        ----------
+        values : mapping
+            By name; arrays also where the FMU has a scalar for each element.
+        instance : str
+            Name for errors and findings.
+
+        Raises
+        ------
+        InputError
+            If there is no such variable, or a value is not of its type or shape.
+        """
+        plain, key = as_arrays(values)
+        if key not in self._known:
+            self._known[key] = self._choose(plain)
+        chosen = self._known[key]
+        numbers = [value.reshape(-1) for value in plain.values() if not _is_text(value)]
+        flat = np.concatenate(numbers)[chosen.at] if numbers else np.empty(0)
+        given = chosen.form.given(flat, {name: plain[name] for name in chosen.form.texts})
+        return given, [attrs.evolve(one, instance=instance) for one in chosen.refused]
+
+    def _choose(self, values: Mapping[str, Any]) -> _Chosen:
+        about = self._file.about
+        kept, refused = settable(about, spread(about, values))
+        form = self._file.given(kept).form
+        places, begin = {}, 0  # of each number, in its stead
+        for name, value in values.items():
+            if not _is_text(value):
+                places[name] = begin + np.arange(value.size, dtype=float).reshape(value.shape)
+                begin += value.size
+        place = spread(about, places)
+        at = [np.ravel(place[name]) for name in form.names]
+        return _Chosen(form, np.concatenate([*at, []]).astype(int), tuple(refused))
+
+
+@attrs.frozen(eq=False)
+class _Chosen:
+    """Which of values of the same names and shapes are set.
+
+    Attributes
+    ----------
+    form : Form
+        Of those that are set.
+    at : (n,) array of int
+        Where their numbers are among all.
+    refused : tuple of StartFinding
+        About the others.
+    """
+
+    form: Form
+    at: np.ndarray[Any, np.dtype[np.int64]]
+    refused: tuple[StartFinding, ...]
 
 
 def spread(about: About, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -140,7 +211,7 @@ def read_back(instance: FmuInstance, values: Mapping[str, Any]) -> list[StartFin
         What was set, by name.
     """
     findings, about = [], instance.file.about
-    for name, wanted, found in _pairs(instance, values):
+    for name, wanted, found in _pairs(instance, instance.file.given(values)):
         if isinstance(found, FmuError):
             what, message = "not read back", found.message
         elif _same(about.variable(name), wanted, found):
@@ -151,25 +222,24 @@ def read_back(instance: FmuInstance, values: Mapping[str, Any]) -> list[StartFin
     return findings
 
 
-def _pairs(instance: FmuInstance, values: Mapping[str, Any]) -> Iterable[tuple[str, Any, Any]]:
+def _pairs(instance: FmuInstance, given: Given) -> Iterable[tuple[str, Any, Any]]:
     """Name, what was set and what is there; all numbers in one call where that works.
 
     Where all of the numbers are the very same, as they nearly always are, they are left out.
     """
-    numbers = {n: np.ravel(np.asarray(v, float)) for n, v in values.items() if not _is_text(v)}
-    if numbers:
+    form = given.form
+    if form.names:
         try:
-            found = instance.read(instance.file.ports(tuple(numbers)))
+            found = instance.read(form.ports)
         except FmuError:
-            for name, wanted in numbers.items():
-                yield name, wanted, _attempt(instance, name)
+            for name in form.names:
+                yield name, given[name], _attempt(instance, name)
         else:
-            if found.tolist() != np.concatenate(list(numbers.values())).tolist():
-                ends = np.cumsum([wanted.size for wanted in numbers.values()])
-                yield from zip(numbers, numbers.values(), np.split(found, ends[:-1]), strict=True)
-    for name, value in values.items():
-        if _is_text(value):
-            yield name, value, _attempt(instance, name)
+            if not (found == given.flat).all():
+                for k, name in enumerate(form.names):
+                    yield name, given.flat[form.part(k)], found[form.part(k)]
+    for name, text in given.texts.items():
+        yield name, text, _attempt(instance, name)
 
 
 def _attempt(instance: FmuInstance, name: str) -> Any:

