@@ -233,15 +233,15 @@ class Turns:
                 began = time.thread_time()
                 run(begin, end)
                 best[name] = min(best[name], time.thread_time() - began)
-        few = max(20, min(200, rounds))
+        few = max(100, min(2000, 1_000_000 // self.setting.n))  # a second or less
         law = self.setting.system().law
         numpy = self._numpy(self._plants[3], few, engine.choose(law, "numpy"))
         alone = self._numpy(self._plants[4], few, engine.Choice("numpy"))
         steps = self.setting.n / 1e9
         return {
             **{name: value / steps / self.per_turn for name, value in best.items()},
-            "numpy path": numpy / steps,  # g and sec in C
-            "numpy path, all": alone / steps,  # by numpy as well
+            "numpy path": numpy / steps,  # the law in C
+            "numpy path, all": alone / steps,  # in numpy as well
         }
 
     def _numpy(self, plant: FmuPlant, steps: int, choice: engine.Choice) -> float:

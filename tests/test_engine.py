@@ -19,8 +19,8 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.cosim import engine, native
 from posmas_fmi.cosim.channel import Arrivals, Channel, Mailbox
 from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.compiled_step import compiled_step
 from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
-from posmas_fmi.cosim.functions import Functions
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import Outcome, System
 from posmas_fmi.errors import BuildError, FmuCallError, InputError
@@ -184,37 +184,40 @@ def test_engine_agrees_with_the_numpy_loop(name: str, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("example", [example_1(), wide()], ids=["example 1", "other sizes"])
-def test_compiled_functions_of_any_number_of_agents(example: Example) -> None:
+def test_the_step_in_c_of_any_number_of_agents(example: Example) -> None:
     agent = agent_of(example)
     law = ProtocolLaw(agent, make_protocol(digraph(2), *GAINS[agent.m], 1.0))
-    library = native.load(engine.choose(law, "c").library)
-    expected, compiled = law.functions, law.with_functions(library).functions
+    constants = law.constants(0.01)
+    step = compiled_step(native.load(engine.choose(law, "c").library), constants, agent.p)
     random = np.random.default_rng(5)
-    X, U = random.uniform(0, 2, (agent.m, 19)), random.uniform(-3, 3, (agent.p, 19))
-    X[0, 4] = 1e8  # beyond the reduction of sin
-    wanted = np.empty_like(X)
-    expected.g(0.7, X, wanted)
-    every = np.empty_like(X)
-    compiled.g(0.7, X, every)
+    X = random.uniform(0, 2, (agent.m, 19))
+    D, s = random.uniform(-1, 1, (agent.m + agent.q, 19)), random.uniform(0, 2, agent.m)
+    u = law.protocol.K @ D[: agent.m]
+    applied = agent.sec_numpy(u.T).T
+    held = law.protocol.E @ D[agent.m :] + agent.B @ applied
+    model = law.propagator(0.01)
+    ahead = model(0.7, s[None], np.zeros((1, agent.m)))[0]
+    wanted = {"memory": model(0.7, X.T, held.T).T, "u": u, "applied": applied}
+    names = ("memory", "leader", "u", "applied")
+    every = dict(zip(names, step(0.7, D, X, s), strict=True))
     for n in range(1, 20):  # whole groups of lanes, and what is left
-        some = np.full((2 * agent.m, n), np.nan)
-        some[: agent.m] = X[:, :n]
-        compiled.g(0.7, some[: agent.m], some[agent.m :])
-        np.testing.assert_allclose(some[agent.m :], wanted[:, :n], rtol=1e-14, atol=1e-14)
-        np.testing.assert_array_equal(some[agent.m :], every[:, :n])
-        given = np.ascontiguousarray(U[:, :n])
-        np.testing.assert_allclose(compiled.sec(given), expected.sec(U[:, :n]), rtol=1e-14)
+        first = (np.ascontiguousarray(columns[:, :n]) for columns in (D, X))
+        some = dict(zip(names, step(0.7, *first, s), strict=True))
+        np.testing.assert_allclose(some["leader"], ahead, rtol=1e-13, atol=1e-13)
+        for name, expected in wanted.items():
+            np.testing.assert_allclose(some[name], expected[:, :n], rtol=1e-13, atol=1e-13)
+            np.testing.assert_array_equal(some[name], every[name][:, :n])
     with pytest.raises(TypeError, match="contiguous"):
-        compiled.sec(U[:, ::2])
+        step(0.7, D, X[:, ::2], s)
 
 
-def test_the_numpy_loop_says_where_its_functions_are_from(
+def test_the_numpy_loop_says_where_its_law_is_from(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[Any] = []
-    original = Functions.compiled
+    original = ProtocolLaw.compiled
     monkeypatch.setattr(
-        Functions, "compiled", lambda *given: taken.append(given) or original(*given)
+        ProtocolLaw, "compiled", lambda *given: taken.append(given) or original(*given)
     )
     case = Case(until=0.05)
     choice = engine.choose(case.system().law, "numpy")

@@ -57,7 +57,7 @@ class Choice:
     reason : str
         Why not C, where it is not.
     library : Path or None
-        The engine's. The numpy loop takes g and sec from it, where there is one.
+        The engine's. The numpy loop takes the step of the law from it, where there is one.
     """
 
     engine: Literal["c", "numpy"]
@@ -68,7 +68,7 @@ class Choice:
         """Return what a manifest says about it."""
         facts: dict[str, str] = {"used": self.engine}
         if self.engine == "numpy":
-            facts["functions"] = "numpy" if self.library is None else "c"  # g and sec
+            facts["functions"] = "numpy" if self.library is None else "c"  # of the law
         if self.library is not None:
             facts["library"] = self.library.name  # the name holds a hash of its sources
         return facts | ({"reason": self.reason} if self.reason else {})
@@ -182,7 +182,7 @@ def run(
     if choice.engine == "numpy":
         begin = snapshots.start.k if snapshots is not None and snapshots.start else 0
         if choice.library is not None and isinstance(system.law, ProtocolLaw):
-            law = system.law.with_functions(native.load(choice.library))
+            law = system.law.compiled(native.load(choice.library))
             system = attrs.evolve(system, law=law)
         return simulate(
             system,

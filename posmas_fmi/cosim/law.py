@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from posmas_fmi.agent import Agent
-from posmas_fmi.cosim.functions import Functions
+from posmas_fmi.cosim.compiled_step import Step, compiled_step
 from posmas_fmi.cosim.propagator import Propagator
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array, VectorFunction
@@ -262,11 +262,6 @@ class ProtocolLaw(CompiledLaw):
         The model that observers and leader compute with.
     protocol : Protocol
 
-    Attributes
-    ----------
-    functions : Functions
-        How g and sec of the agent are evaluated: with numpy, unless `with_functions` was asked.
-
     Examples
     --------
     >>> from posmas_fmi.agent import linear_agent
@@ -283,21 +278,28 @@ class ProtocolLaw(CompiledLaw):
 
     def __init__(self, agent: Agent, protocol: Protocol) -> None:
         self.agent, self.protocol = agent, protocol
-        self.functions = Functions.of(agent)
         self.weights = Weights.of(protocol, innovation=agent.q)
-        self._steps: dict[float, Propagator] = {}
+        self._propagators: dict[float, Propagator] = {}
+        self._library: CDLL | None = None
+        self._steps: dict[float, Step] = {}  # in C
 
     def propagator(self, h: float) -> Propagator:
         """Return the sampled propagation of the model over h [s]."""
-        if h not in self._steps:
-            self._steps[h] = Propagator.of(self.agent, h, self.functions.g)
-        return self._steps[h]
+        if h not in self._propagators:
+            self._propagators[h] = Propagator.of(self.agent, h)
+        return self._propagators[h]
 
-    def with_functions(self, library: CDLL) -> ProtocolLaw:
-        """Return this law with g and sec in C, from the library of its `sources`."""
+    def compiled(self, library: CDLL) -> ProtocolLaw:
+        """Return this law with its `step` in C, from the library of its `sources`."""
         law = copy(self)
-        law.functions, law._steps = Functions.compiled(library), {}
+        law._library, law._steps = library, {}
         return law
+
+    def _in_c(self, h: float) -> Step | None:
+        if self._library is not None and h not in self._steps:
+            constants = self.constants(h)
+            self._steps[h] = compiled_step(self._library, constants, self.agent.p)
+        return self._steps.get(h)
 
     def sources(self) -> Sources:
         """Return the sources of the engine; g and sec must be expressions."""
@@ -351,22 +353,28 @@ class ProtocolLaw(CompiledLaw):
     ) -> Decision:
         """Equation (6), and the observer over one communication step; the leader runs free."""
         agent, N, m = self.agent, len(memory), self.agent.m
+        disagreement = weights.disagreement(sent, heard).T
+        step = self._in_c(h)
+        if step is not None:
+            after, ahead, u, applied = step(t, disagreement, np.ascontiguousarray(memory.T), leader)
+            return Decision(u.T, applied.T, after.T, ahead)
         propagator = self.propagator(h)
         known = propagator.room(N + 1)  # of the agents and the leader
         states, held = known[:m], known[m : 2 * m]
-        disagreement = weights.disagreement(sent, heard).T
         u = np.dot(self.protocol.K, disagreement[:m])
-        applied = self.functions.sec(u)
+        applied = agent.sec_numpy(u.T).T
         states[:, :N], states[:, N] = memory.T, leader
         held[:, :N] = np.dot(self.protocol.E, disagreement[m:])
         held[:, :N] += np.dot(agent.B, applied)
         held[:, N] = 0.0
-        after = propagator.advance(t, known).T
-        return Decision(u.T, applied.T, after[:N], after[N])
+        known_after = propagator.advance(t, known).T
+        return Decision(u.T, applied.T, known_after[:N], known_after[N])
 
     def leader_message(self, memory: Array) -> Array:
         """Return the state, and no innovation."""
-        return np.concatenate([memory, np.zeros(self.agent.q)])
+        message = np.zeros(self.agent.m + self.agent.q)
+        message[: self.agent.m] = memory
+        return message
 
     def leader_step(self, t: float, h: float, memory: Array) -> Array:
         """Return the leader's state (3) after one step."""

@@ -351,6 +351,7 @@ class Run:
         self.extra_at = np.flatnonzero(~is_u)
         self.lengths = system.clock.times(system.every)  # of the steps [s]
         self.everyone = np.arange(system.instances)
+        self.begins = np.zeros(system.instances)  # of their steps, where all take them at once
         self.in_step = bool((system.every == 1).all())  # every period is one communication step
         self.all_act = self.in_step  # and none is frozen
         of_agents = system.every[:N]
@@ -621,7 +622,9 @@ class Run:
     def _step_once(self, k: int, latest: Array, guessed: bool = False) -> Array:
         """Step stage after stage; inputs are made of `latest`, which is brought up to date."""
         system, state, clock = self.system, self.state, self.system.clock
-        self.ahead[:] = guessed
+        extrapolates = system.wiring.extrapolates
+        if extrapolates:
+            self.ahead[:] = guessed
         for stage in system.stages:
             begins = ends = stage
             if not self.all_act:
@@ -631,8 +634,10 @@ class Run:
             self._set_inputs(begins, latest)
             if not len(ends):
                 continue
-            t = np.full(len(ends), clock.time(k))
-            if not self.in_step:
+            if self.in_step:
+                t = self.begins[: len(ends)]
+                t.fill(clock.time(k))
+            else:
                 t = clock.times(k + 1 - system.every[ends])
             lengths = self.lengths if len(ends) == len(self.lengths) else self.lengths[ends]
             self.plant.step(ends, t, lengths, state.inputs, latest)
@@ -642,7 +647,7 @@ class Run:
                 ends = ends[~self.plant.frozen[ends]]  # some may have failed in this very step
             self.plant.read(ends, clock.time(k + 1), latest)
             state.k = k
-            if system.wiring.extrapolates:
+            if extrapolates:
                 for i in ends:
                     self.ahead[self.plant.reading_at[i] : self.plant.reading_at[i + 1]] = True
         return latest
@@ -745,7 +750,7 @@ def _taker(starts: Whole, count: int) -> Callable[[Array], Array]:
     widths = np.diff(starts)
     N, width = len(widths), int(widths[0])
     if (widths == width).all() and starts[0] == 0:
-        return lambda values: values[: N * width].reshape(N, width)[:, :count].T.copy()
+        return lambda values: values[: N * width].reshape(N, width).T[:count].copy()
     places = starts[:-1] + np.arange(count)[:, None]
     return lambda values: values[places]
 

@@ -48,16 +48,14 @@ class Propagator:
     end: Array
 
     @classmethod
-    def of(
-        cls, agent: Agent, h: float, g: Callable[[float, Array, Array], None] | None = None
-    ) -> Propagator:
-        """Precompute the matrices for one agent model and step; g is the agent's by default."""
+    def of(cls, agent: Agent, h: float) -> Propagator:
+        """Precompute the matrices for one agent model and step."""
         phi0, phi1, phi2, phi3 = _phi_functions(agent.A * h)
         half0, half1, _, _ = _phi_functions(agent.A * (0.5 * h))
         return cls(
             h=h,
             H=agent.H,
-            g=g or agent.g_columns,
+            g=agent.g_columns,
             full=phi0,
             half=half0,
             gamma=h * phi1,

@@ -23,8 +23,9 @@ LANES_INLINE void store(double *to, const Lanes *from, int first, int rows)
 void WITH_LANES(controller_block)(const Controller *c, int agents, double t, const double *driven,
                                   const double *disagreement, const double *memory, double *next,
                                   double *u, double *applied);
-void WITH_LANES(columns_g)(double t, const double *x, double *g, int64_t n);
-void WITH_LANES(columns_sec)(const double *u, double *sec, int64_t n);
+void WITH_LANES(columns_step)(const Controller *c, double t, const double *disagreement,
+                              const double *memory, double *next, double *u, double *applied,
+                              int64_t n);
 
 void WITH_LANES(controller_block)(const Controller *c, int agents, double t, const double *driven,
                                   const double *disagreement, const double *memory, double *next,
@@ -65,37 +66,37 @@ LANES_INLINE void store_columns(double *to, const Lanes *from, int64_t first, in
         memcpy(to + i * n + first, &from[i], (size_t)count * sizeof(double));
 }
 
-LANES_INLINE void some_g(double t, const double *x, double *g, int64_t first, int64_t n,
-                         int64_t count)
+LANES_INLINE void some_step(const Controller *c, double t, const double *disagreement,
+                            const double *memory, double *next, double *u, double *applied,
+                            int64_t first, int64_t n, int64_t count)
 {
-    Lanes state[M], value[M];
-    load_columns(state, x, first, n, M, count);
-    agent_g(lanes_of(t), state, value);
-    store_columns(g, value, first, n, M, count);
+    Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
+    Lanes input[GROUPS][P], taken[GROUPS][P], driven[GROUPS];
+    int64_t of_group[GROUPS];
+    for (int k = 0; k < GROUPS; k++) {
+        const int64_t at = first + k * LANES, left = count - k * LANES;
+        of_group[k] = left < 0 ? 0 : left < LANES ? left : LANES;
+        driven[k] = lanes_of(1);
+        load_columns(all[k], disagreement, at, n, MESSAGE, of_group[k]);
+        load_columns(before[k], memory, at, n, M, of_group[k]);
+    }
+    step(c, t, driven, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after, input, taken);
+    for (int k = 0; k < GROUPS; k++) {
+        const int64_t at = first + k * LANES;
+        store_columns(next, after[k], at, n, M, of_group[k]);
+        store_columns(u, input[k], at, n, P, of_group[k]);
+        store_columns(applied, taken[k], at, n, P, of_group[k]);
+    }
 }
 
-LANES_INLINE void some_sec(const double *u, double *sec, int64_t first, int64_t n, int64_t count)
+void WITH_LANES(columns_step)(const Controller *c, double t, const double *disagreement,
+                              const double *memory, double *next, double *u, double *applied,
+                              int64_t n)
 {
-    Lanes input[P], value[P];
-    load_columns(input, u, first, n, P, count);
-    agent_sec(input, value);
-    store_columns(sec, value, first, n, P, count);
-}
-
-void WITH_LANES(columns_g)(double t, const double *x, double *g, int64_t n)
-{
+    enum { WHOLE = GROUPS * LANES };
     int64_t first = 0;
-    for (; first + LANES <= n; first += LANES)
-        some_g(t, x, g, first, n, LANES); /* a constant: no calls to copy */
+    for (; first + WHOLE <= n; first += WHOLE) /* a constant: no calls to copy */
+        some_step(c, t, disagreement, memory, next, u, applied, first, n, WHOLE);
     if (first < n)
-        some_g(t, x, g, first, n, n - first);
-}
-
-void WITH_LANES(columns_sec)(const double *u, double *sec, int64_t n)
-{
-    int64_t first = 0;
-    for (; first + LANES <= n; first += LANES)
-        some_sec(u, sec, first, n, LANES);
-    if (first < n)
-        some_sec(u, sec, first, n, n - first);
+        some_step(c, t, disagreement, memory, next, u, applied, first, n, n - first);
 }

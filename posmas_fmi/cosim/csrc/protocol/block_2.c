@@ -6,11 +6,10 @@
 
 typedef void Block(const Controller *, int, double, const double *, const double *, const double *,
                    double *, double *, double *);
-typedef void G(double, const double *, double *, int64_t);
-typedef void Sec(const double *, double *, int64_t);
+typedef void Columns(const Controller *, double, const double *, const double *, double *, double *,
+                     double *, int64_t);
 Block controller_block_4, controller_block_8;
-G columns_g_4, columns_g_8;
-Sec columns_sec_4, columns_sec_8;
+Columns columns_step_4, columns_step_8;
 
 static int lanes_here(void)
 {
@@ -38,14 +37,11 @@ void controller_block(const Controller *c, int agents, double t, const double *d
     CHOOSE(controller_block)(c, agents, t, driven, disagreement, memory, next, u, applied);
 }
 
-EXPORT void agent_columns_g(double t, const double *x, double *g, int64_t n)
+EXPORT void controller_columns(const Controller *c, double t, const double *disagreement,
+                               const double *memory, double *next, double *u, double *applied,
+                               int64_t n, const double *leader, double *leader_next)
 {
     const int lanes = lanes_here();
-    CHOOSE(columns_g)(t, x, g, n);
-}
-
-EXPORT void agent_columns_sec(const double *u, double *sec, int64_t n)
-{
-    const int lanes = lanes_here();
-    CHOOSE(columns_sec)(u, sec, n);
+    controller_leader(c, t, leader, leader_next);
+    CHOOSE(columns_step)(c, t, disagreement, memory, next, u, applied, n);
 }

@@ -64,10 +64,11 @@ void controller_block(const Controller *c, int agents, double t, const double *d
                       const double *disagreement, const double *memory, double *next, double *u,
                       double *applied);
 
-/* g (M, n) at the states x (M, n), and sec (P, n) of the inputs u (P, n): a column each. For a loop
- * that is not in C; block_2.c exports them. */
-void agent_columns_g(double t, const double *x, double *g, int64_t n);
-void agent_columns_sec(const double *u, double *sec, int64_t n);
+/* The same for any number n of agents, from disagreement (MESSAGE, n) and memory (M, n) to next (M, n),
+ * u (P, n) and applied (P, n), and for the leader. For a loop that is not in C: block_2.c exports it. */
+void controller_columns(const Controller *c, double t, const double *disagreement,
+                        const double *memory, double *next, double *u, double *applied, int64_t n,
+                        const double *leader, double *leader_next);
 
 /* The leader: its memory (MEMORY) at t + h, and what it sends (MESSAGE). */
 void controller_leader(const Controller *c, double t, const double *memory, double *next);
