@@ -629,7 +629,7 @@ def table(
             (f"FMI {fmi}, N = {n}: engine over the floor", over["engine"], ENGINE[n], True)
         )
     if n == 1000:
-        for name, how in (("numpy path", "g, sec in C"), ("numpy path, all", "all by numpy")):
+        for name, how in (("numpy path", "the law in C"), ("numpy path, all", "all by numpy")):
             what = f"FMI {fmi}, N = {n}: numpy path ({how}) over the floor"
             verdicts.append((what, over[name], 1.5, True))
     if with_peers and n <= 1000:
