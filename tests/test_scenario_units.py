@@ -50,6 +50,8 @@ def test_a_run_in_other_units_is_the_same_run(folder: Path) -> None:
         run(load(scenario(folder, *changes)), folder / name, report=False)
         with xarray.open_dataset(folder / name / "results.nc") as data:
             found.append({key: data[key].values for key in ("y", "heat_load", "facility.header")})
+            assert (data["heat_load"].units, data["facility.header"].units) == ("W", "1")
+            assert "units" not in data["y"].attrs  # of model (1), which has none
     for key, values in found[0].items():
         np.testing.assert_allclose(found[1][key], values, rtol=1e-9, atol=1e-9)
     assert np.ptp(found[0]["y"]) > 1e-3

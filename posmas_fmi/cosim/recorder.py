@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from itertools import product
@@ -44,6 +44,8 @@ class Layout:
         Labels of the dimensions.
     of_agents, of_run : tuple of str
         Further variables with one value for each agent, and with one for all.
+    units : mapping of str to str
+        Of variables, where they are known.
     """
 
     agents: tuple[str, ...]
@@ -52,6 +54,7 @@ class Layout:
     outputs: tuple[str, ...]
     of_agents: tuple[str, ...] = ()
     of_run: tuple[str, ...] = ()
+    units: Mapping[str, str] = attrs.field(factory=dict)
 
     def shape(self, variable: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
         """Dimensions and sizes of one row of a variable."""
@@ -253,7 +256,9 @@ class Recorder:
         time.attrs["units"] = "s"
         for name in self._variables:
             dimensions, _ = layout.shape(name)
-            file.create_variable(name, ("time", *dimensions), float, fillvalue=np.nan)
+            values = file.create_variable(name, ("time", *dimensions), float, fillvalue=np.nan)
+            if name in layout.units:
+                values.attrs["units"] = layout.units[name]
         file.attrs.update({**self._attributes, "complete": int(complete)})
 
     # ---- rows -----------------------------------------------------------------------------------

@@ -518,6 +518,7 @@ def _recorder(
         outputs=tuple(f"y{k + 1}" for k in range(agent.q)),
         of_agents=tuple(recorded.of_agents),
         of_run=(*recorded.of_components, *(("set_point",) if scenario.cooling else ())),
+        units={**recorded.units, **({"set_point": "K"} if scenario.cooling else {})},
     )
     attributes = {
         "scenario": scenario.name,

@@ -142,10 +142,13 @@ class Recorded:
         Column of each agent, by variable; ``agents.x`` where a result has an x of its own.
     of_components : dict of str to int
         Column by ``component.variable``.
+    units : dict of str to str
+        By the same names, where the FMUs say them and agree.
     """
 
     of_agents: dict[str, tuple[int, ...]] = attrs.field(factory=dict)
     of_components: dict[str, int] = attrs.field(factory=dict)
+    units: dict[str, str] = attrs.field(factory=dict)
 
     def named(self, values: dict[str, Array]) -> dict[str, Array]:
         """Give the columns of ``extra``, (r, columns), their names; other arrays stay."""
@@ -439,4 +442,12 @@ class Wires:
             _label(f"{self._all[r.instance].name}.{r.variable}"): len(wanted) + k
             for k, r in enumerate(of_component)
         }
-        return wiring, Recorded(of_agents, of_components)
+        units: dict[str, str] = {}
+        for name, columns in {**of_agents, **{n: (k,) for n, k in of_components.items()}}.items():
+            told = {self._told_unit(recorded[column]) for column in columns}
+            if len(told) == 1 and (unit := told.pop()):
+                units[name] = unit
+        return wiring, Recorded(of_agents, of_components, units)
+
+    def _told_unit(self, reading: _Reading) -> str | None:
+        return self._all[reading.instance].about.variable(reading.variable).unit
