@@ -35,7 +35,7 @@ typedef struct {
 enum {
     NOTHING, SEGFAULT, ABORT, EXIT, HANG, ERROR, FATAL, DISCARD, OUTSIDE, NOT_A_NUMBER, STACK,
     MEMORY, LOGS, OUTPUT, CLOSES, ONCE, EXIT_READING, FREE_CRASHES, TERMINATES,
-    CHANGES, OPENS, FILLS, DAEMON, SLOW, STRANGER
+    CHANGES, OPENS, FILLS, DAEMON, SLOW, STRANGER, TELLS
 };
 
 static int instances;
@@ -146,9 +146,12 @@ static int go_wrong(Plant *p)
         break;
     case CHANGES: /* what it shares with the others in its process */
         fesetround(FE_UPWARD);
-        setlocale(LC_ALL, "C");
-        if (chdir("/"))
+        if (!setlocale(LC_NUMERIC, "C.UTF-8") || chdir("/"))
             abort();
+        p->callbacks->logger(p->callbacks->environment, p->name, 0, NULL, setlocale(LC_ALL, NULL));
+        break;
+    case TELLS: /* how it finds its process */
+        p->callbacks->logger(p->callbacks->environment, p->name, 0, NULL, setlocale(LC_ALL, NULL));
         break;
     case SLOW: /* here, and when it is read */
         usleep(900000);

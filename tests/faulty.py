@@ -23,6 +23,7 @@ FAULTS = (
     *("nothing", "segfault", "abort", "exit", "hang", "error", "fatal", "discard", "outside"),
     *("not a number", "stack", "memory", "logs", "output", "closes", "once", "exit reading"),
     *("free crashes", "terminates", "changes", "opens", "fills", "daemon", "slow", "stranger"),
+    "tells",
 )
 
 DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>

@@ -282,6 +282,17 @@ def test_what_an_fmu_changes_in_its_process_is_put_back(fmu: Path) -> None:
     np.testing.assert_array_equal(np.concatenate(rows)[:, 0], healthy[:, 0])
 
 
+def test_the_locale_is_put_back(fmu: Path) -> None:
+    told = {}
+    for fault in ("nothing", "changes"):
+        faults = {0: values(fault, at=0.2), 1: values("tells", at=0.4)}
+        with faulty_plant(fmu, faults, isolation()) as plant:
+            assert engine.run(faulty_system(), plant).ended == "complete"
+            changed, told[fault] = (one.messages for one in plant._instances[:2])
+    assert len(told["nothing"]) == 1
+    assert told["changes"] == told["nothing"] != changed
+
+
 def test_a_fault_at_the_start_is_an_error_of_the_start(fmu: Path) -> None:
     for fault in ("segfault", "exit"):
         with pytest.raises(FmuLostError, match=r"faulty\.fmu: 2: fmi2ExitInitializationMode"):
