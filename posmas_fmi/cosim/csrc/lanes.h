@@ -6,9 +6,9 @@
  * -ffp-contract=off): results do not depend on how agents are grouped.
  *
  * sin, cos, exp and tanh: reduction after Cody and Waite (Software Manual for the Elementary
- * Functions, 1980) with polynomials fitted at Chebyshev nodes, at most 2 units in the last place
- * (tanh: 4). An argument beyond the range of the reduction, and every other function, goes lane by
- * lane to math.h. */
+ * Functions, 1980) with polynomials fitted at Chebyshev nodes, at most 3 units in the last place
+ * (exp 2, tanh 4). An argument beyond the range of the reduction, and every other function, goes lane
+ * by lane to math.h. */
 #ifndef LANES_H
 #define LANES_H
 
@@ -155,26 +155,27 @@ LANES_INLINE Lanes lanes_polynomial(const double *c, Lanes z)
     return a + zz * (b + zz * d);
 }
 
-/* sin(x + quarters pi / 2) for |x| < 1e6 */
-LANES_INLINE Lanes lanes_circular(Lanes x, int64_t quarters)
+/* sin x for |x| < 1e6, or cos x where `half` is 0.5: x = q pi / 2 + y with q even for sin, odd for
+ * cos, so that what is left is sin y or -sin y with |y| up to pi / 2 */
+LANES_INLINE Lanes lanes_circular(Lanes x, double half)
 {
-    static const double S[] = {-0.16666666666666666, 0.008333333333330946, -0.00019841269836753985,
-                               2.755731610017207e-06, -2.505113134896025e-08,
-                               1.5918093561437567e-10};
-    static const double C[] = {0.041666666666666664, -0.0013888888888887395,
-                               2.4801587298762816e-05, -2.755731727024068e-07,
-                               2.0876145958084937e-09, -1.1382610070998183e-11};
-    /* pi / 2 in three parts, the first two of 33 bits: their products with n are exact */
+    static const double S[] = {-0.16666666666666666, 0.008333333333333316, -0.00019841269841254974,
+                               2.755731921916323e-06, -2.5052107616995878e-08,
+                               1.6058977312444268e-10, -7.643970296165793e-13,
+                               2.73144475909634e-15};
+    /* pi / 2 in three parts, the first two of 33 bits: their products with q are exact */
     const double P1 = 1.5707963267341256, P2 = 6.077100506303966e-11, P3 = 2.0222662487959506e-21;
-    const Lanes shifted = x * 0.6366197723675814 + LANES_TO_INTEGER;
-    const Bits quadrant = lanes_bits(shifted) + quarters;
-    const Lanes n = shifted - LANES_TO_INTEGER;
-    const Lanes t = x - n * P1, w = n * P2, r = t - w, rest = n * P3 - ((t - r) - w);
-    const Lanes y = r - rest, z = y * y;
-    const Lanes sine = y + y * (z * lanes_polynomial(S, z));
-    const Lanes cosine = (1.0 - 0.5 * z) + z * z * lanes_polynomial(C, z);
-    const Lanes chosen = lanes_select(-(quadrant & 1), cosine, sine);
-    return lanes_from(lanes_bits(chosen) ^ ((quadrant & 2) << 62));
+    const Lanes shifted = (x * 0.3183098861837907 - half) + LANES_TO_INTEGER;
+    const Lanes n = shifted - LANES_TO_INTEGER, q = n + n + 2.0 * half;
+    const Lanes t = x - q * P1, w = q * P2, y = t - w, z = y * y, zz = z * z;
+    const Lanes low = (S[0] + S[1] * z) + zz * (S[2] + S[3] * z);
+    const Lanes high = (S[4] + S[5] * z) + zz * (S[6] + S[7] * z);
+    /* what y lacks, times the slope there: so y need not be waited for */
+    const Lanes rest = q * P3 - ((t - y) - w);
+    const Lanes slope = 1.0 + z * (-0.5 + z * (0.041666666666666664 - 0.001388888888888889 * z));
+    const Lanes sine = y + (y * z * (low + zz * zz * high) - rest * slope);
+    const Bits turned = half == 0 ? lanes_bits(shifted) : ~lanes_bits(shifted); /* odd: the sign */
+    return lanes_from(lanes_bits(sine) ^ (turned << 63));
 }
 
 #define LANES_TURNS 1e6 /* sin and cos are reduced below it */
@@ -189,7 +190,7 @@ LANES_INLINE Lanes lanes_sin(Lanes x)
 
 LANES_INLINE Lanes lanes_cos(Lanes x)
 {
-    Lanes y = lanes_circular(x, 1);
+    Lanes y = lanes_circular(x, 0.5);
     if (!lanes_all_below(x, LANES_TURNS))
         lanes_replace(cos, &x, LANES_TURNS, &y);
     return y;

@@ -27,26 +27,36 @@ void WITH_LANES(columns_step)(const Controller *c, double t, const double *disag
                               const double *memory, double *next, double *u, double *applied,
                               int64_t n);
 
+/* Agents first …, of the columns of a block, in so many vectors. */
+LANES_INLINE void of_block(const int groups, const Controller *c, int first, double t,
+                       const double *driven, const double *disagreement, const double *memory,
+                       double *next, double *u, double *applied)
+{
+    Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
+    Lanes input[GROUPS][P], taken[GROUPS][P], counts[GROUPS];
+    for (int k = 0; k < groups; k++) {
+        load(&counts[k], driven, first + k * LANES, 1);
+        load(all[k], disagreement, first + k * LANES, MESSAGE);
+        load(before[k], memory, first + k * LANES, M);
+    }
+    step(groups, c, t, counts, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after,
+         input, taken);
+    for (int k = 0; k < groups; k++) {
+        store(next, after[k], first + k * LANES, M);
+        store(u, input[k], first + k * LANES, P);
+        store(applied, taken[k], first + k * LANES, P);
+    }
+}
+
 void WITH_LANES(controller_block)(const Controller *c, int agents, double t, const double *driven,
                                   const double *disagreement, const double *memory, double *next,
                                   double *u, double *applied)
 {
-    for (int first = 0; first < agents; first += GROUPS * LANES) {
-        Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
-        Lanes input[GROUPS][P], taken[GROUPS][P], counts[GROUPS];
-        for (int k = 0; k < GROUPS; k++) {
-            load(&counts[k], driven, first + k * LANES, 1);
-            load(all[k], disagreement, first + k * LANES, MESSAGE);
-            load(before[k], memory, first + k * LANES, M);
-        }
-        step(c, t, counts, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after, input,
-             taken);
-        for (int k = 0; k < GROUPS; k++) {
-            store(next, after[k], first + k * LANES, M);
-            store(u, input[k], first + k * LANES, P);
-            store(applied, taken[k], first + k * LANES, P);
-        }
-    }
+    int first = 0;
+    for (; first + LANES < agents; first += GROUPS * LANES)
+        of_block(GROUPS, c, first, t, driven, disagreement, memory, next, u, applied);
+    if (first < agents) /* one vector is enough */
+        of_block(1, c, first, t, driven, disagreement, memory, next, u, applied);
 }
 
 /* Columns first … first + count - 1 of a matrix with n columns; the other lanes are 0. */
@@ -80,7 +90,8 @@ LANES_INLINE void some_step(const Controller *c, double t, const double *disagre
         load_columns(all[k], disagreement, at, n, MESSAGE, of_group[k]);
         load_columns(before[k], memory, at, n, M, of_group[k]);
     }
-    step(c, t, driven, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after, input, taken);
+    step(GROUPS, c, t, driven, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after,
+         input, taken);
     for (int k = 0; k < GROUPS; k++) {
         const int64_t at = first + k * LANES;
         store_columns(next, after[k], at, n, M, of_group[k]);
