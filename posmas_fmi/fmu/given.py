@@ -142,9 +142,7 @@ class Forms:
             return values
         plain, key = as_arrays(values)
         form = self._form(key)
-        numbers = [value.reshape(-1) for value in plain.values() if not isinstance(value, str)]
-        flat = np.concatenate(numbers) if numbers else np.empty(0)
-        return form.given(flat, {name: plain[name] for name in form.texts})
+        return form.given(flattened(plain), {name: plain[name] for name in form.texts})
 
     def _form(self, key: Key) -> Form:
         if key not in self._known:
@@ -222,3 +220,9 @@ def as_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], Key]:
             raise InputError(f"expected numbers for {name!r} (got {value!r})") from None
         key.append((name, array.shape))
     return plain, tuple(key)
+
+
+def flattened(plain: Mapping[str, Any]) -> Array:
+    """Return all numbers of what `as_arrays` has made, one after the other."""
+    numbers = [value.reshape(-1) for value in plain.values() if not isinstance(value, str)]
+    return np.concatenate(numbers) if numbers else np.empty(0)

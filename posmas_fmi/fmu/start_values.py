@@ -12,7 +12,7 @@ import numpy as np
 from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.file import FmuFile
-from posmas_fmi.fmu.given import Form, Given, Key, as_arrays
+from posmas_fmi.fmu.given import Form, Given, Key, as_arrays, flattened
 from posmas_fmi.fmu.instance import FmuInstance
 from posmas_fmi.fmu.variables import REAL, WHOLE, Variable
 
@@ -70,8 +70,7 @@ class StartValues:
         if key not in self._known:
             self._known[key] = self._choose(plain)
         chosen = self._known[key]
-        numbers = [value.reshape(-1) for value in plain.values() if not _is_text(value)]
-        flat = np.concatenate(numbers)[chosen.at] if numbers else np.empty(0)
+        flat = flattened(plain)[chosen.at]
         given = chosen.form.given(flat, {name: plain[name] for name in chosen.form.texts})
         return given, [attrs.evolve(one, instance=instance) for one in chosen.refused]
 

@@ -29,8 +29,8 @@ void WITH_LANES(columns_step)(const Controller *c, double t, const double *disag
 
 /* Agents first …, of the columns of a block, in so many vectors. */
 LANES_INLINE void of_block(const int groups, const Controller *c, int first, double t,
-                       const double *driven, const double *disagreement, const double *memory,
-                       double *next, double *u, double *applied)
+                           const double *driven, const double *disagreement, const double *memory,
+                           double *next, double *u, double *applied)
 {
     Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
     Lanes input[GROUPS][P], taken[GROUPS][P], counts[GROUPS];
