@@ -1,6 +1,7 @@
 /* Calls into FMUs: every status and every value that is read is checked. */
 #include "fmus.h"
 
+#include <float.h>
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -106,60 +107,113 @@ static int asks_to_end(const Binding *b, void *component, double *reached)
     return terminated != 0;
 }
 
+/* How fast the inputs change, for an FMU of FMI 2. */
+static int set_rates(const Fmus *f, const Binding *b, int64_t instance, const double *rates,
+                     Report *report)
+{
+    const int64_t before = said(f);
+    begin(f, CALL_SET_RATES, instance);
+    const int status = ((SetRates2 *)b->set_rates)(f->component[instance], b->rate_references,
+                                                   (size_t)b->n_rates, b->rate_orders, rates);
+    return status == OK || odd(status, CALL_SET_RATES, instance, before, report);
+}
+
+static int step_2(const Fmus *f, const Binding *b, int64_t instance, double t, double h,
+                  Report *report)
+{
+    void *component = f->component[instance];
+    const int64_t before = said(f);
+    begin(f, CALL_STEP, instance);
+    const int status = ((Step2 *)b->do_step)(component, t, h, 0);
+    if (status == OK)
+        return 1;
+    double reached = t;
+    if (status == DISCARD && asks_to_end(b, component, &reached))
+        return fail(report, (Incident){.call = CALL_STEP_TERMINATED,
+                                       .instance = instance,
+                                       .value = reached});
+    return odd(status, CALL_STEP, instance, before, report);
+}
+
+/* What an FMU of FMI 3 says after a step. */
+typedef struct {
+    int status;
+    bool event, terminate, early;
+    double reached;
+} After;
+
+static inline After do_step_3(const Binding *b, void *component, double t, double h)
+{
+    After after = {.reached = t};
+    after.status = ((Step3 *)b->do_step)(component, t, h, false, &after.event, &after.terminate,
+                                         &after.early, &after.reached);
+    return after;
+}
+
+/* The rest of a step over h from t that was not simply done. */
+static __attribute__((noinline, cold)) int go_on_3(const Fmus *f, const Binding *b,
+                                                   int64_t instance, double t, double h,
+                                                   int64_t before, After after, Report *report)
+{
+    double begin_at = t;
+    for (int64_t returns = 0;; returns++) {
+        if (after.status != OK && !odd(after.status, CALL_STEP, instance, before, report))
+            return 0;
+        if (!after.terminate && !after.early)
+            return 1;
+        const double reached = after.reached;
+        const int inside = reached >= begin_at && reached <= t + h + SAME * h; /* not of NaN */
+        if (after.terminate || !inside || returns == MOST_RETURNS) {
+            const Call call = after.terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
+            const double value = after.terminate && !inside ? begin_at : reached;
+            return fail(report, (Incident){.call = call, .instance = instance, .value = value});
+        }
+        if (reached >= t + h - SAME * h)
+            return 1;
+        begin_at = reached; /* go on to the end of the step */
+        after = do_step_3(b, f->component[instance], begin_at, t + h - reached);
+    }
+}
+
+static int step_3(const Fmus *f, const Binding *b, int64_t instance, double t, double h,
+                  Report *report)
+{
+    const int64_t before = said(f);
+    begin(f, CALL_STEP, instance);
+    const After after = do_step_3(b, f->component[instance], t, h);
+    if (after.status == OK && !after.terminate && !after.early)
+        return 1;
+    return go_on_3(f, b, instance, t, h, before, after, report);
+}
+
 int fmus_step(const Fmus *f, int64_t instance, double t, double h, const double *inputs,
               double *scratch, Report *report)
 {
     const Binding *b = &f->bindings[f->binding[instance]];
-    void *component = f->component[instance];
-    const double *rates = inputs + b->inputs.n_ports;
+    const double *values = inputs;
     if (b->inputs.places || b->inputs.scale) {
         if (!convert(f, b, instance, inputs, scratch, report))
             return 0;
-        inputs = scratch;
+        values = scratch;
     }
-    int64_t before = said(f);
+    const int64_t before = said(f);
     begin(f, CALL_SET, instance);
-    int status = set(b, component, &b->inputs, inputs);
+    const int status = set(b, f->component[instance], &b->inputs, values);
     if (status != OK && !odd(status, CALL_SET, instance, before, report))
         return 0;
-    if (b->n_rates && b->set_rates) {
-        before = said(f);
-        begin(f, CALL_SET_RATES, instance);
-        status = ((SetRates2 *)b->set_rates)(component, b->rate_references, (size_t)b->n_rates,
-                                             b->rate_orders, rates);
-        if (status != OK && !odd(status, CALL_SET_RATES, instance, before, report))
-            return 0;
-    }
-    before = said(f);
-    begin(f, CALL_STEP, instance);
-    if (b->fmi == 2) {
-        status = ((Step2 *)b->do_step)(component, t, h, 0);
-        double reached = t;
-        if (status == DISCARD && asks_to_end(b, component, &reached))
-            return fail(report, (Incident){.call = CALL_STEP_TERMINATED,
-                                           .instance = instance,
-                                           .value = reached});
-        return status == OK || odd(status, CALL_STEP, instance, before, report);
-    }
-    double begin_at = t, length = h;
-    for (int64_t returns = 0;; returns++) {
-        bool event = false, terminate = false, early = false;
-        double reached = begin_at;
-        status = ((Step3 *)b->do_step)(component, begin_at, length, false, &event, &terminate,
-                                       &early, &reached);
-        if (status != OK && !odd(status, CALL_STEP, instance, before, report))
-            return 0;
-        const int inside = reached >= begin_at && reached <= t + h + SAME * h; /* not of NaN */
-        if (terminate || (early && (!inside || returns == MOST_RETURNS))) {
-            const Call call = terminate ? CALL_STEP_TERMINATED : CALL_STEP_EARLY;
-            const double value = terminate && !inside ? begin_at : reached;
-            return fail(report, (Incident){.call = call, .instance = instance, .value = value});
-        }
-        if (!early || reached >= t + h - SAME * h)
-            return 1;
-        begin_at = reached; /* go on to the end of the step */
-        length = t + h - reached;
-    }
+    if (b->n_rates && b->set_rates &&
+        !set_rates(f, b, instance, inputs + b->inputs.n_ports, report))
+        return 0;
+    return b->fmi == 2 ? step_2(f, b, instance, t, h, report)
+                       : step_3(f, b, instance, t, h, report);
+}
+
+static int all_finite(const double *values, int64_t n)
+{
+    int finite = 1; /* a bit to each: no branch */
+    for (int64_t k = 0; k < n; k++)
+        finite &= fabs(values[k]) <= DBL_MAX;
+    return finite;
 }
 
 int fmus_read(const Fmus *f, int64_t instance, double *values, double *scratch, Report *report)
@@ -174,6 +228,8 @@ int fmus_read(const Fmus *f, int64_t instance, double *values, double *scratch, 
     const int status = get(b, f->component[instance], p, direct ? values : scratch);
     if (status != OK && !odd(status, CALL_GET, instance, before, report))
         return 0;
+    if (direct && all_finite(values, p->n_ports))
+        return 1;
     for (int64_t k = 0; k < p->n_ports; k++) {
         const double value = direct ? values[k] : scratch[p->places ? p->places[k] : k];
         if (!isfinite(value))
