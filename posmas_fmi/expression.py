@@ -312,7 +312,7 @@ class _ExactC(C99CodePrinter):
 class _LanesC(_ExactC):
     """C code for many values at once: the types and functions of cosim/csrc/lanes.h."""
 
-    _OWN = ("sin", "cos", "exp", "tanh")  # of lanes.h; others go to math.h one by one
+    _RANGED = ("sin", "cos", "exp")  # of lanes.h, with a range; others go to math.h one by one
 
     def lanes(self, expr: sympy.Expr) -> str:
         """Print an expression, as lanes also where it is a number."""
@@ -323,8 +323,10 @@ class _LanesC(_ExactC):
         name, args = expr.func.__name__, expr.args
         if not expr.free_symbols:
             return repr(float(expr))
-        if name in self._OWN:
-            return f"lanes_{name}({self._print(args[0])})"
+        if name in self._RANGED:
+            return f"lanes_{name}({self._print(args[0])}, range)"
+        if name == "tanh":
+            return f"lanes_tanh({self._print(args[0])})"
         return f"lanes_each({name}, {self._print(args[0])})"
 
     _print_sin = _print_cos = _print_exp = _print_tanh = _print_Function
@@ -439,7 +441,8 @@ class VectorFunction:
         names : dict
             C expression for each variable.
         lanes : bool
-            For many values at once: ``Lanes`` of cosim/csrc/lanes.h instead of ``double``.
+            For many values at once: ``Lanes`` of cosim/csrc/lanes.h instead of ``double``, with a
+            ``LanesRange *range`` in scope.
         """
         printer = _LanesC() if lanes else _ExactC()
         put = printer.lanes if isinstance(printer, _LanesC) else printer.doprint

@@ -24,14 +24,16 @@ FUNCTIONS = ("sin", "cos", "exp", "tanh", "sqrt", "abs", "sign")
 EACH = """
 #include "lanes.h"
 #include "export.h"
-#define EACH(name)                                                      \\
+#define EACH(name, call)                                                \\
     EXPORT void run_##name(const double *x, double *y, int64_t n)       \\
     {                                                                   \\
+        LanesRange range = {.mends = 1};                                \\
+        (void)range;                                                    \\
         for (int64_t i = 0; i < n; i += LANES) {                        \\
             LanesView view;                                             \\
             for (int l = 0; l < LANES; l++)                             \\
                 view.lane[l] = x[i + l];                                \\
-            view.value = lanes_##name(view.value);                      \\
+            view.value = call;                                          \\
             for (int l = 0; l < LANES; l++)                             \\
                 y[i + l] = view.lane[l];                                \\
         }                                                               \\
@@ -53,7 +55,9 @@ def pointer(array: np.ndarray) -> ctypes.c_void_p:
 @pytest.fixture(scope="module", params=[1, 2, 4, 8])
 def lanes(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable:
     """A function by its name, computed in so many lanes; values in multiples of 8."""
-    code = EACH + "".join(f"EACH({name})\n" for name in FUNCTIONS)
+    more = dict.fromkeys(("sin", "cos", "exp"), ", &range")
+    calls = (f"EACH({name}, lanes_{name}(view.value{more.get(name, '')}))\n" for name in FUNCTIONS)
+    code = EACH + "".join(calls)
     folder = tmp_path_factory.mktemp("lanes")
     library = compiled({"each.c": code}, ["each.c"], folder, (f"-DLANES={request.param}",))
 
@@ -125,8 +129,9 @@ EXPRESSIONS = """
 EXPORT void run(double t, const double *x, double *g)
 {
     Lanes from[M], to[M];
+    LanesRange range = {.mends = 1};
     memcpy(from, x, sizeof from);
-    agent_g(lanes_of(t), from, to);
+    agent_g(lanes_of(t), from, to, &range);
     memcpy(g, to, sizeof to);
 }
 """
@@ -189,9 +194,8 @@ def test_blocks_give_the_bits_of_single_agents(example, tmp_path: Path) -> None:
     agent = Agent(A=example.A, H=example.H, B=example.B, C=example.C, g=example.g, sec=example.sec)
     step = Propagator.of(agent, 0.01)
     random = np.random.default_rng(3)
-    matrices = (random.normal(size=(p, m)), random.normal(size=(m, q)), agent.B, agent.C, agent.H)
-    steps = (step.full, step.half, step.gamma, step.half_gamma, step.start, step.middle, step.end)
-    constants = np.concatenate([[0.01], *(a.ravel() for a in (*matrices, *steps))])
+    matrices = (random.normal(size=(p, m)), random.normal(size=(m, q)), agent.B, agent.C)
+    constants = np.concatenate([[0.01], *(a.ravel() for a in (*matrices, *step.in_c))])
     disagreement, memory = random.normal(size=(m + q, B)), random.uniform(0, 2, (m, B))
     memory[:, 5] *= 1e8  # beyond the reduction of sin
     driven, t = np.array([1.0] * 15 + [0.0]), ctypes.c_double(0.7)

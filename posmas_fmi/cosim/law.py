@@ -316,12 +316,8 @@ class ProtocolLaw(CompiledLaw):
 
     def constants(self, h: float) -> Array:
         """Return the members of csrc/protocol/controller.h's structure."""
-        agent, protocol, step = self.agent, self.protocol, self.propagator(h)
-        matrices = (
-            *(protocol.K, protocol.E, agent.B, agent.C, agent.H),
-            *(step.full, step.half, step.gamma, step.half_gamma),
-            *(step.start, step.middle, step.end),
-        )
+        agent, protocol = self.agent, self.protocol
+        matrices = (protocol.K, protocol.E, agent.B, agent.C, *self.propagator(h).in_c)
         return np.concatenate([[h], *(matrix.ravel() for matrix in matrices)])
 
     def start(self, xhat0: Array) -> Array:

@@ -80,6 +80,13 @@ class Propagator:
         of_g = [part @ self.H for part in (self.start, self.middle, self.middle, self.end)]
         return a, b, c, np.hstack([self.full, self.gamma, *of_g])
 
+    @property
+    def in_c(self) -> tuple[Array, ...]:
+        """The matrices (m, m) of csrc/protocol/controller.h, from ``full`` on."""
+        half_g = self.half_gamma @ self.H
+        of_g = (part @ self.H for part in (self.start, self.middle, self.end))
+        return self.full, self.half, self.gamma, self.half_gamma, half_g, 2.0 * half_g, *of_g
+
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""
         m = X.shape[1]

@@ -186,8 +186,9 @@ def _lanes_header(g: VectorFunction, sec: VectorFunction, m: int, p: int, q: int
         ("agent_g", "Lanes t, const Lanes *x", ("t", "x"), "g", g, states),
         ("agent_sec", "const Lanes *u", ("u",), "sec", sec, inputs),
     ):
-        lines += ["", f"LANES_INLINE void {name}({arguments}, Lanes *{target})", "{"]
-        lines += [f"    (void){argument};" for argument in unused]
+        head = f"LANES_INLINE void {name}({arguments}, Lanes *{target}, LanesRange *range)"
+        lines += ["", head, "{"]
+        lines += [f"    (void){argument};" for argument in (*unused, "range")]
         lines += [f"    {line}" for line in function.c_code(target, names, True).splitlines()]
         lines += ["}"]
     return "\n".join([*lines, "#endif", "", "#endif", ""])

@@ -7,8 +7,8 @@
  *
  * sin, cos, exp and tanh: reduction after Cody and Waite (Software Manual for the Elementary
  * Functions, 1980) with polynomials fitted at Chebyshev nodes, at most 3 units in the last place
- * (exp 2, tanh 4). An argument beyond the range of the reduction, and every other function, goes lane
- * by lane to math.h. */
+ * (exp 2, tanh 4). An argument beyond the range of the reduction (see LanesRange), and every other
+ * function, goes lane by lane to math.h. */
 #ifndef LANES_H
 #define LANES_H
 
@@ -129,21 +129,37 @@ LANES_INLINE int lanes_none(Bits mask)
 #endif
 }
 
-/* Whether all lanes are below the limit in modulus; NaN is not. */
-LANES_INLINE int lanes_all_below(Lanes x, double limit)
+/* What is done about arguments beyond the range of a reduction. Where `mends` is set they go to
+ * math.h at once. Otherwise they are only noted: without a branch at each sin the compiler can lay
+ * what does not depend on each other side by side. Where `beyond` is not empty after that, no lane is
+ * to be used and all is to be computed again with `mends`; other lanes have the same bits both ways. */
+typedef struct {
+    int mends;
+    Bits beyond;
+} LanesRange;
+
+/* The lanes that are not below the limit by math.h. */
+static __attribute__((noinline, cold, unused)) Lanes lanes_mended(double (*f)(double), Lanes x,
+                                                                  double limit, Lanes y)
 {
-    return lanes_none(~LANES_WHERE(lanes_abs(x) < lanes_of(limit)));
+    const LanesView from = {.value = x};
+    LanesView to = {.value = y};
+    for (int l = 0; l < LANES; l++)
+        if (!(fabs(from.lane[l]) < limit))
+            to.lane[l] = f(from.lane[l]);
+    return to.value;
 }
 
-/* Replace the lanes that are not below the limit by what math.h says. */
-static __attribute__((noinline, unused)) void lanes_replace(double (*f)(double), const Lanes *x,
-                                                            double limit, Lanes *y)
+/* y, which is f(x) where |x| is below the limit; NaN is not. */
+LANES_INLINE Lanes lanes_within(double (*f)(double), Lanes x, double limit, Lanes y,
+                                LanesRange *range)
 {
-    const double *from = (const double *)x;
-    double *to = (double *)y;
-    for (int l = 0; l < LANES; l++)
-        if (!(fabs(from[l]) < limit))
-            to[l] = f(from[l]);
+    const Bits beyond = ~LANES_WHERE(lanes_abs(x) < lanes_of(limit));
+    if (!range->mends) {
+        range->beyond |= beyond;
+        return y;
+    }
+    return lanes_none(beyond) ? y : lanes_mended(f, x, limit, y);
 }
 
 #define LANES_TO_INTEGER 6755399441055744.0 /* 1.5 * 2^52: adding it rounds to an integer */
@@ -155,45 +171,38 @@ LANES_INLINE Lanes lanes_polynomial(const double *c, Lanes z)
     return a + zz * (b + zz * d);
 }
 
-/* sin x for |x| < 1e6, or cos x where `half` is 0.5: x = q pi / 2 + y with q even for sin, odd for
- * cos, so that what is left is sin y or -sin y with |y| up to pi / 2 */
+/* sin x for |x| < 1e6, or cos x where `half` is 0.5: x = q pi + y with q a whole number for sin, and
+ * that and a half for cos, so that what is left is sin y or -sin y with |y| up to pi / 2 */
 LANES_INLINE Lanes lanes_circular(Lanes x, double half)
 {
     static const double S[] = {-0.16666666666666666, 0.008333333333333316, -0.00019841269841254974,
                                2.755731921916323e-06, -2.5052107616995878e-08,
                                1.6058977312444268e-10, -7.643970296165793e-13,
                                2.73144475909634e-15};
-    /* pi / 2 in three parts, the first two of 33 bits: their products with q are exact */
-    const double P1 = 1.5707963267341256, P2 = 6.077100506303966e-11, P3 = 2.0222662487959506e-21;
-    const Lanes shifted = (x * 0.3183098861837907 - half) + LANES_TO_INTEGER;
-    const Lanes n = shifted - LANES_TO_INTEGER, q = n + n + 2.0 * half;
-    const Lanes t = x - q * P1, w = q * P2, y = t - w, z = y * y, zz = z * z;
+    /* pi in three parts, the first two of 33 bits: their products with q are exact, and so is what
+     * is left where most is cancelled */
+    const double P1 = 3.1415926534682512, P2 = 1.2154201012607932e-10, P3 = 4.044532497591901e-21;
+    const Lanes turns = x * 0.3183098861837907;
+    const Lanes shifted = (half == 0 ? turns : turns - half) + LANES_TO_INTEGER;
+    const Lanes n = shifted - LANES_TO_INTEGER, q = half == 0 ? n : n + half;
+    const Lanes y = ((x - q * P1) - q * P2) - q * P3, z = y * y, zz = z * z;
     const Lanes low = (S[0] + S[1] * z) + zz * (S[2] + S[3] * z);
     const Lanes high = (S[4] + S[5] * z) + zz * (S[6] + S[7] * z);
-    /* what y lacks, times the slope there: so y need not be waited for */
-    const Lanes rest = q * P3 - ((t - y) - w);
-    const Lanes slope = 1.0 + z * (-0.5 + z * (0.041666666666666664 - 0.001388888888888889 * z));
-    const Lanes sine = y + (y * z * (low + zz * zz * high) - rest * slope);
+    const Lanes sine = y + y * z * (low + zz * zz * high);
     const Bits turned = half == 0 ? lanes_bits(shifted) : ~lanes_bits(shifted); /* odd: the sign */
     return lanes_from(lanes_bits(sine) ^ (turned << 63));
 }
 
 #define LANES_TURNS 1e6 /* sin and cos are reduced below it */
 
-LANES_INLINE Lanes lanes_sin(Lanes x)
+LANES_INLINE Lanes lanes_sin(Lanes x, LanesRange *range)
 {
-    Lanes y = lanes_circular(x, 0);
-    if (!lanes_all_below(x, LANES_TURNS))
-        lanes_replace(sin, &x, LANES_TURNS, &y);
-    return y; /* sin(-0) is +0 */
+    return lanes_within(sin, x, LANES_TURNS, lanes_circular(x, 0), range); /* sin(-0) is +0 */
 }
 
-LANES_INLINE Lanes lanes_cos(Lanes x)
+LANES_INLINE Lanes lanes_cos(Lanes x, LanesRange *range)
 {
-    Lanes y = lanes_circular(x, 0.5);
-    if (!lanes_all_below(x, LANES_TURNS))
-        lanes_replace(cos, &x, LANES_TURNS, &y);
-    return y;
+    return lanes_within(cos, x, LANES_TURNS, lanes_circular(x, 0.5), range);
 }
 
 /* x = n ln 2 + r; power: 2^n; returns e^r - 1, for |x| < 700 */
@@ -217,12 +226,10 @@ LANES_INLINE Lanes lanes_expm1_reduced(Lanes x, Lanes *power)
 
 #define LANES_EXPONENT 700.0 /* e^x is normal, with room, below it */
 
-LANES_INLINE Lanes lanes_exp(Lanes x)
+LANES_INLINE Lanes lanes_exp(Lanes x, LanesRange *range)
 {
-    Lanes power, less = lanes_expm1_reduced(x, &power), y = power + power * less;
-    if (!lanes_all_below(x, LANES_EXPONENT))
-        lanes_replace(exp, &x, LANES_EXPONENT, &y);
-    return y;
+    Lanes power, less = lanes_expm1_reduced(x, &power);
+    return lanes_within(exp, x, LANES_EXPONENT, power + power * less, range);
 }
 
 /* tanh x = e / (e + 2) with e = e^(2x) - 1; beyond 20 it is 1 to the last bit */

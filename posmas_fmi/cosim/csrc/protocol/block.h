@@ -7,19 +7,6 @@
 #define PASTE_VALUE(name, lanes) PASTE(name, lanes)
 #define WITH_LANES(name) PASTE_VALUE(name, LANES)
 
-/* Columns first … first + LANES - 1 of a matrix with CONTROLLER_BLOCK columns. */
-LANES_INLINE void load(Lanes *to, const double *from, int first, int rows)
-{
-    for (int i = 0; i < rows; i++)
-        memcpy(&to[i], from + i * CONTROLLER_BLOCK + first, sizeof(Lanes));
-}
-
-LANES_INLINE void store(double *to, const Lanes *from, int first, int rows)
-{
-    for (int i = 0; i < rows; i++)
-        memcpy(to + i * CONTROLLER_BLOCK + first, &from[i], sizeof(Lanes));
-}
-
 void WITH_LANES(controller_block)(const Controller *c, int agents, double t, const double *driven,
                                   const double *disagreement, const double *memory, double *next,
                                   double *u, double *applied);
@@ -27,87 +14,96 @@ void WITH_LANES(columns_step)(const Controller *c, double t, const double *disag
                               const double *memory, double *next, double *u, double *applied,
                               int64_t n);
 
-/* Agents first …, of the columns of a block, in so many vectors. */
-LANES_INLINE void of_block(const int groups, const Controller *c, int first, double t,
-                           const double *driven, const double *disagreement, const double *memory,
-                           double *next, double *u, double *applied)
+/* Matrices whose columns are agents, all with `stride` columns. */
+typedef struct {
+    const double *driven; /* NULL: all are */
+    const double *disagreement, *memory;
+    double *next, *u, *applied;
+    int64_t stride;
+} Columns;
+
+/* Columns first … first + count - 1 of a matrix; other lanes are 0. */
+LANES_INLINE void load(Lanes *to, const double *from, int64_t first, int64_t stride, int rows,
+                       int64_t count)
 {
-    Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
-    Lanes input[GROUPS][P], taken[GROUPS][P], counts[GROUPS];
-    for (int k = 0; k < groups; k++) {
-        load(&counts[k], driven, first + k * LANES, 1);
-        load(all[k], disagreement, first + k * LANES, MESSAGE);
-        load(before[k], memory, first + k * LANES, M);
-    }
-    step(groups, c, t, counts, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after,
-         input, taken);
-    for (int k = 0; k < groups; k++) {
-        store(next, after[k], first + k * LANES, M);
-        store(u, input[k], first + k * LANES, P);
-        store(applied, taken[k], first + k * LANES, P);
+    for (int i = 0; i < rows; i++) {
+        to[i] = lanes_of(0);
+        memcpy(&to[i], from + i * stride + first, (size_t)count * sizeof(double));
     }
 }
+
+LANES_INLINE void store(double *to, const Lanes *from, int64_t first, int64_t stride, int rows,
+                        int64_t count)
+{
+    for (int i = 0; i < rows; i++)
+        memcpy(to + i * stride + first, &from[i], (size_t)count * sizeof(double));
+}
+
+/* Of `count` columns those in vector k. */
+LANES_INLINE int64_t in_group(int k, int64_t count)
+{
+    const int64_t left = count - k * LANES;
+    return left < 0 ? 0 : left < LANES ? left : LANES;
+}
+
+/* The step for columns first … first + count - 1, in so many vectors. Returns whether it holds: not
+ * where an argument was beyond a range and `mends` is not set. */
+LANES_INLINE int step_columns(const int groups, const int mends, const Controller *c, double t,
+                              const Columns *of, int64_t first, int64_t count)
+{
+    Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
+    Lanes input[GROUPS][P], taken[GROUPS][P], driven[GROUPS];
+    LanesRange range = {.mends = mends};
+    for (int k = 0; k < groups; k++) {
+        const int64_t at = first + k * LANES, some = in_group(k, count);
+        driven[k] = lanes_of(1);
+        if (of->driven)
+            load(&driven[k], of->driven, at, of->stride, 1, some);
+        load(all[k], of->disagreement, at, of->stride, MESSAGE, some);
+        load(before[k], of->memory, at, of->stride, M, some);
+    }
+    step(groups, c, t, driven, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after,
+         input, taken, &range);
+    for (int k = 0; k < groups; k++) {
+        const int64_t at = first + k * LANES, some = in_group(k, count);
+        store(of->next, after[k], at, of->stride, M, some);
+        store(of->u, input[k], at, of->stride, P, some);
+        store(of->applied, taken[k], at, of->stride, P, some);
+    }
+    return lanes_none(range.beyond);
+}
+
+static __attribute__((noinline, cold)) void mend(const Controller *c, double t, const Columns *of,
+                                                 int64_t first, int64_t count)
+{
+    for (int64_t end = first + count; first < end; first += LANES)
+        step_columns(1, 1, c, t, of, first, end - first < LANES ? end - first : LANES);
+}
+
+enum { WHOLE = GROUPS * LANES };
 
 void WITH_LANES(controller_block)(const Controller *c, int agents, double t, const double *driven,
                                   const double *disagreement, const double *memory, double *next,
                                   double *u, double *applied)
 {
+    const Columns of = {driven, disagreement, memory, next, u, applied, CONTROLLER_BLOCK};
     int first = 0;
-    for (; first + LANES < agents; first += GROUPS * LANES)
-        of_block(GROUPS, c, first, t, driven, disagreement, memory, next, u, applied);
-    if (first < agents) /* one vector is enough */
-        of_block(1, c, first, t, driven, disagreement, memory, next, u, applied);
-}
-
-/* Columns first … first + count - 1 of a matrix with n columns; the other lanes are 0. */
-LANES_INLINE void load_columns(Lanes *to, const double *from, int64_t first, int64_t n, int rows,
-                               int64_t count)
-{
-    for (int i = 0; i < rows; i++) {
-        to[i] = lanes_of(0);
-        memcpy(&to[i], from + i * n + first, (size_t)count * sizeof(double));
-    }
-}
-
-LANES_INLINE void store_columns(double *to, const Lanes *from, int64_t first, int64_t n, int rows,
-                                int64_t count)
-{
-    for (int i = 0; i < rows; i++)
-        memcpy(to + i * n + first, &from[i], (size_t)count * sizeof(double));
-}
-
-LANES_INLINE void some_step(const Controller *c, double t, const double *disagreement,
-                            const double *memory, double *next, double *u, double *applied,
-                            int64_t first, int64_t n, int64_t count)
-{
-    Lanes all[GROUPS][MESSAGE], before[GROUPS][M], after[GROUPS][M];
-    Lanes input[GROUPS][P], taken[GROUPS][P], driven[GROUPS];
-    int64_t of_group[GROUPS];
-    for (int k = 0; k < GROUPS; k++) {
-        const int64_t at = first + k * LANES, left = count - k * LANES;
-        of_group[k] = left < 0 ? 0 : left < LANES ? left : LANES;
-        driven[k] = lanes_of(1);
-        load_columns(all[k], disagreement, at, n, MESSAGE, of_group[k]);
-        load_columns(before[k], memory, at, n, M, of_group[k]);
-    }
-    step(GROUPS, c, t, driven, (const Lanes(*)[MESSAGE])all, (const Lanes(*)[M])before, after,
-         input, taken);
-    for (int k = 0; k < GROUPS; k++) {
-        const int64_t at = first + k * LANES;
-        store_columns(next, after[k], at, n, M, of_group[k]);
-        store_columns(u, input[k], at, n, P, of_group[k]);
-        store_columns(applied, taken[k], at, n, P, of_group[k]);
-    }
+    for (; first + LANES < agents; first += WHOLE)
+        if (!step_columns(GROUPS, 0, c, t, &of, first, WHOLE))
+            mend(c, t, &of, first, WHOLE);
+    if (first < agents && !step_columns(1, 0, c, t, &of, first, LANES)) /* one vector is enough */
+        mend(c, t, &of, first, LANES);
 }
 
 void WITH_LANES(columns_step)(const Controller *c, double t, const double *disagreement,
                               const double *memory, double *next, double *u, double *applied,
                               int64_t n)
 {
-    enum { WHOLE = GROUPS * LANES };
+    const Columns of = {NULL, disagreement, memory, next, u, applied, n};
     int64_t first = 0;
     for (; first + WHOLE <= n; first += WHOLE) /* a constant: no calls to copy */
-        some_step(c, t, disagreement, memory, next, u, applied, first, n, WHOLE);
-    if (first < n)
-        some_step(c, t, disagreement, memory, next, u, applied, first, n, n - first);
+        if (!step_columns(GROUPS, 0, c, t, &of, first, WHOLE))
+            mend(c, t, &of, first, WHOLE);
+    if (first < n && !step_columns(GROUPS, 0, c, t, &of, first, n - first))
+        mend(c, t, &of, first, n - first);
 }

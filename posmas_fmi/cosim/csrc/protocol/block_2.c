@@ -6,10 +6,10 @@
 
 typedef void Block(const Controller *, int, double, const double *, const double *, const double *,
                    double *, double *, double *);
-typedef void Columns(const Controller *, double, const double *, const double *, double *, double *,
-                     double *, int64_t);
+typedef void Step(const Controller *, double, const double *, const double *, double *, double *,
+                  double *, int64_t);
 Block controller_block_4, controller_block_8;
-Columns columns_step_4, columns_step_8;
+Step columns_step_4, columns_step_8;
 
 static int lanes_here(void)
 {

@@ -23,14 +23,16 @@ void controller_step(const Controller *c, const double *own, double t, const dou
 {
     (void)own, (void)measured, (void)silence;
     const Lanes driven = 1;
+    LanesRange range = {.mends = 1};
     step(1, c, t, &driven, (const Lanes(*)[MESSAGE])disagreement, (const Lanes(*)[M])memory,
-         (Lanes(*)[M])next, (Lanes(*)[P])u, (Lanes(*)[P])applied);
+         (Lanes(*)[M])next, (Lanes(*)[P])u, (Lanes(*)[P])applied, &range);
 }
 
 void controller_leader(const Controller *c, double t, const double *memory, double *next)
 {
     const Lanes none[1][M] = {{0}};
-    propagate(1, c, t, (const Lanes(*)[M])memory, none, (Lanes(*)[M])next);
+    LanesRange range = {.mends = 1};
+    propagate(1, c, t, (const Lanes(*)[M])memory, none, (Lanes(*)[M])next, &range);
 }
 
 void controller_leader_send(const Controller *c, const double *memory, double *message)

@@ -32,14 +32,15 @@ typedef struct {
     double E[M * Q];    /* observer gain */
     double B[M * P];
     double C[Q * M];
-    double H[M * M];
-    double full[M * M]; /* e^(A h) */
-    double half[M * M]; /* e^(A h/2) */
-    double gamma[M * M];      /* integral of e^(A tau) from 0 to h */
-    double half_gamma[M * M]; /* the same to h/2 */
-    double start[M * M];      /* weights of H g at the start, the middle and the end of the step */
-    double middle[M * M];
-    double end[M * M];
+    double full[M * M];         /* e^(A h) */
+    double half[M * M];         /* e^(A h/2) */
+    double gamma[M * M];        /* integral of e^(A tau) from 0 to h */
+    double half_gamma[M * M];   /* the same to h/2 */
+    double half_g[M * M];       /* half_gamma H, the weight of g over half a step */
+    double twice_half_g[M * M]; /* and that twice */
+    double start_g[M * M];      /* weights of g at the start, the middle and the end of the step */
+    double middle_g[M * M];
+    double end_g[M * M];
 } Controller;
 
 /* message (MESSAGE) = [xhat, y - C xhat] */

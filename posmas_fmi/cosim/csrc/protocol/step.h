@@ -9,14 +9,7 @@
 #include "controller.h"
 #include "lanes.h"
 
-/* to += W from, with W of shape (rows, columns) */
-LANES_INLINE void add_product(Lanes *to, const double *W, const Lanes *from, int rows, int columns)
-{
-    for (int i = 0; i < rows; i++)
-        for (int j = 0; j < columns; j++)
-            to[i] += W[i * columns + j] * from[j];
-}
-
+/* W from, with W of shape (rows, columns) */
 LANES_INLINE void set_product(Lanes *to, const double *W, const Lanes *from, int rows, int columns)
 {
     for (int i = 0; i < rows; i++) {
@@ -26,78 +19,78 @@ LANES_INLINE void set_product(Lanes *to, const double *W, const Lanes *from, int
     }
 }
 
-LANES_INLINE void copy(Lanes *to, const Lanes *from)
+/* to += W from: the sum of a product comes last, for it is what is waited for */
+LANES_INLINE void add_product(Lanes *to, const double *W, const Lanes *from, int rows, int columns)
 {
-    for (int i = 0; i < M; i++)
-        to[i] = from[i];
-}
-
-/* slope (M) = H g(t, x) */
-LANES_INLINE void weighted_g(const Controller *c, double t, const Lanes *x, Lanes *slope)
-{
-    Lanes g[M];
-    agent_g(lanes_of(t), x, g);
-    set_product(slope, c->H, g, M, M);
+    for (int i = 0; i < rows; i++) {
+        Lanes product;
+        set_product(&product, W + i * columns, from, 1, columns);
+        to[i] += product;
+    }
 }
 
 /* One step of x' = A x + H g(t, x) + w with w held, for some vectors in turn: a stage waits for
  * the one before it, and meanwhile the processor can compute that of another group. */
 LANES_INLINE void propagate(const int groups, const Controller *c, double t, const Lanes x[][M],
-                            const Lanes w[][M], Lanes next[][M])
+                            const Lanes w[][M], Lanes next[][M], LanesRange *range)
 {
-    Lanes ga[GROUPS][M], gb[GROUPS][M], gc[GROUPS][M], gd[GROUPS][M];
-    Lanes base[GROUPS][M], a[GROUPS][M], stage[GROUPS][M];
-    const double middle = t + 0.5 * c->h;
+    Lanes g[GROUPS][4][M]; /* at the start, twice in the middle, and at the end */
+    Lanes base[GROUPS][M], known[GROUPS][M], stage[GROUPS][M];
+    const Lanes middle = lanes_of(t + 0.5 * c->h), end = lanes_of(t + c->h);
     for (int k = 0; k < groups; k++)
-        weighted_g(c, t, x[k], ga[k]);
+        agent_g(lanes_of(t), x[k], g[k][0], range);
     for (int k = 0; k < groups; k++) {
+        Lanes of_w[M], of_g[M];
         set_product(base[k], c->half, x[k], M, M);
-        add_product(base[k], c->half_gamma, w[k], M, M);
-        copy(a[k], base[k]);
-        add_product(a[k], c->half_gamma, ga[k], M, M);
-        weighted_g(c, middle, a[k], gb[k]);
+        set_product(of_w, c->half_gamma, w[k], M, M);
+        set_product(of_g, c->half_g, g[k][0], M, M);
+        for (int i = 0; i < M; i++) {
+            base[k][i] += of_w[i];
+            stage[k][i] = base[k][i] + of_g[i];
+            known[k][i] = of_w[i] - of_g[i];
+        }
+        add_product(known[k], c->half, stage[k], M, M);
+        agent_g(middle, stage[k], g[k][1], range);
     }
     for (int k = 0; k < groups; k++) {
-        copy(stage[k], base[k]);
-        add_product(stage[k], c->half_gamma, gb[k], M, M);
-        weighted_g(c, middle, stage[k], gc[k]);
+        for (int i = 0; i < M; i++)
+            stage[k][i] = base[k][i];
+        add_product(stage[k], c->half_g, g[k][1], M, M);
+        agent_g(middle, stage[k], g[k][2], range);
+    }
+    for (int k = 0; k < groups; k++) {
+        for (int i = 0; i < M; i++)
+            stage[k][i] = known[k][i];
+        add_product(stage[k], c->twice_half_g, g[k][2], M, M);
+        agent_g(end, stage[k], g[k][3], range);
     }
     for (int k = 0; k < groups; k++) {
         Lanes sum[M];
         for (int i = 0; i < M; i++)
-            sum[i] = 2.0 * gc[k][i] - ga[k][i] + w[k][i];
-        set_product(stage[k], c->half, a[k], M, M);
-        add_product(stage[k], c->half_gamma, sum, M, M);
-        weighted_g(c, t + c->h, stage[k], gd[k]);
-    }
-    for (int k = 0; k < groups; k++) {
-        Lanes sum[M], end[M];
-        for (int i = 0; i < M; i++)
-            sum[i] = gb[k][i] + gc[k][i];
-        set_product(end, c->full, x[k], M, M);
-        add_product(end, c->gamma, w[k], M, M);
-        add_product(end, c->start, ga[k], M, M);
-        add_product(end, c->middle, sum, M, M);
-        add_product(end, c->end, gd[k], M, M);
-        copy(next[k], end);
+            sum[i] = g[k][1][i] + g[k][2][i];
+        set_product(next[k], c->full, x[k], M, M);
+        add_product(next[k], c->gamma, w[k], M, M);
+        add_product(next[k], c->start_g, g[k][0], M, M);
+        add_product(next[k], c->middle_g, sum, M, M);
+        add_product(next[k], c->end_g, g[k][3], M, M);
     }
 }
 
 /* As controller_step, for all lanes of some vectors; what is held counts `driven` times. */
 LANES_INLINE void step(const int groups, const Controller *c, double t, const Lanes *driven,
                        const Lanes disagreement[][MESSAGE], const Lanes memory[][M],
-                       Lanes next[][M], Lanes u[][P], Lanes applied[][P])
+                       Lanes next[][M], Lanes u[][P], Lanes applied[][P], LanesRange *range)
 {
     Lanes held[GROUPS][M];
     for (int k = 0; k < groups; k++) {
         set_product(u[k], c->K, disagreement[k], P, M);
-        agent_sec(u[k], applied[k]);
-        set_product(held[k], c->B, applied[k], M, P);
-        add_product(held[k], c->E, disagreement[k] + M, M, Q);
+        agent_sec(u[k], applied[k], range);
+        set_product(held[k], c->E, disagreement[k] + M, M, Q);
+        add_product(held[k], c->B, applied[k], M, P);
         for (int i = 0; i < M; i++)
             held[k][i] *= driven[k];
     }
-    propagate(groups, c, t, memory, held, next);
+    propagate(groups, c, t, memory, held, next, range);
 }
 
 #endif
