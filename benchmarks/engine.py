@@ -43,6 +43,7 @@ from posmas_fmi.agent import Agent
 from posmas_fmi.cosim import engine, native
 from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.clock import Clock
+from posmas_fmi.cosim.conditions import Sensors
 from posmas_fmi.cosim.fmu_plant import FmuPlant, PlantSpec, PortMap
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System
@@ -528,6 +529,31 @@ def threads(repeat: int) -> Verdicts:
     return [("two threads, 10 us per step: times as fast", times, 1.6, False)]
 
 
+def arcs_and_sensors(n: int, repeat: int) -> None:
+    """What delay, jitter and loss on every arc, and noise of every sensor, cost a whole run."""
+    setting = Setting.of(n, 200_000 // n)
+    ideal = setting.system()
+    arcs, sensors = ideal.network.adjacency.nnz + 1, (n, ideal.agent.q)
+    channel = Channel.uniform(arcs, H, delay=2 * H, jitter=3 * H, loss=0.1)
+    runs = {
+        "ideal": ideal,
+        "arcs": attrs.evolve(ideal, channel=channel),
+        "noise": attrs.evolve(ideal, sensors=Sensors(np.full(sensors, 1e-3), np.zeros(sensors))),
+    }
+    best = dict.fromkeys(runs, math.inf)
+    for _ in range(repeat):
+        for name, system in runs.items():
+            with setting.plant() as plant:
+                began = time.thread_time()
+                engine.run(system, plant, choice=engine.choose(system.law, "c"))
+                best[name] = min(best[name], time.thread_time() - began)
+    times = {name: value / best["ideal"] for name, value in best.items()}
+    print(
+        f"\n{n} agents: with delay, jitter and loss on every arc {times['arcs']:.2f} times, "
+        f"with noise of every sensor {times['noise']:.2f} times as long"
+    )
+
+
 def start_up(repeat: int) -> Verdicts:
     best = {}
     for n in (1, 1000, 10_000):
@@ -607,6 +633,9 @@ def main() -> None:
             if len(flat) > 1:
                 spread = max(flat) / min(flat)
                 verdicts.append((f"FMI {fmi}: dearest over cheapest, N >= 100", spread, 1.15, True))
+    for n in options.agents:
+        if n <= 1000:
+            arcs_and_sensors(n, min(options.repeat, 3))
     verdicts += threads(options.repeat) + start_up(options.repeat)
     tell(verdicts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
@@ -617,10 +618,43 @@ def test_arrivals_are_those_of_the_mailbox(seed: int, delay: int, jitter: int, l
     channel = Channel.uniform(5, 1.0, delay, jitter, loss)
     mailbox = Mailbox(channel, np.zeros((5, 1)), np.random.default_rng(seed))
     arrivals = Arrivals(channel, np.random.default_rng(seed))
-    ages = np.concatenate([arrivals.draw(0, 7), arrivals.draw(7, 20)])
-    held = np.full(5, -1.0)
+    parts = [arrivals.draw(0, 7), arrivals.draw(7, 16)[:4]]  # the run stopped within the second
+    lost = int(arrivals.lost[:4].sum())
+    again = Arrivals(channel, np.random.default_rng())
+    parts.append(arrivals.draw(11, 16))
+    lost += int(arrivals.lost.sum())
+    again.restore(16, json.loads(json.dumps(arrivals.state())))
+    parts.append(again.draw(16, 20))
+    ages, lost = np.concatenate(parts), lost + int(again.lost.sum())
+    held, before = np.full(5, -1.0), 0
     mailbox.held = held[:, None].copy()
     for k in range(20):
         received = mailbox.exchange(k, np.full((5, 1), float(k)))
         held = np.where(ages[k] >= 0, k - ages[k], held)
         np.testing.assert_array_equal(received[:, 0], held)
+        before = mailbox.lost if k == 6 else before if k > 6 else 0
+    assert lost == mailbox.lost - before
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.integers(0, 3))
+def test_messages_are_on_their_way_as_long_as_the_channel_says(
+    seed: int, jitter: int, delay: int
+) -> None:
+    """Each of the delays comes, about as often as each other one."""
+    channel = Channel.uniform(20, 1.0, delay, jitter)
+    arrives, later = channel.drawn(np.random.default_rng(seed), 200, channel.loss)
+    counts = np.bincount(later.ravel(), minlength=delay + jitter + 1)
+    assert arrives.all()
+    assert counts[:delay].sum() == 0
+    assert abs(counts[delay:] / (4000 / (jitter + 1)) - 1).max() < 0.25  # over 6 deviations
+
+
+def test_the_state_of_another_channel_is_refused() -> None:
+    first, other = (Arrivals(Channel.uniform(n, 1.0, 2), np.random.default_rng(1)) for n in (3, 4))
+    first.draw(0, 5)
+    state = first.state()
+    for wrong in (state | {"taken": [0]}, state | {"coming": [[9, 0, 1]]}, {"random": 1}):
+        with pytest.raises(InputError, match="another channel"):
+            first.restore(5, wrong)
+    with pytest.raises(InputError, match="another channel"):
+        other.restore(5, state)

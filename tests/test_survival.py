@@ -26,6 +26,7 @@ from faulty import faulty_fmu, faulty_plant, faulty_system, values
 
 from posmas_fmi.cli import main
 from posmas_fmi.cosim import engine
+from posmas_fmi.cosim.channel import Channel
 from posmas_fmi.cosim.fmu_plant import FmuPlant, Isolation, PlantSpec, PortMap
 from posmas_fmi.cosim.master import Outcome
 from posmas_fmi.cosim.worker.minder import Limits
@@ -156,6 +157,26 @@ def test_both_loops_say_and_do_the_same(fmu: Path, fault: str, apart: Any, actio
     strip = {"inputs": {}}
     told = [[i.to_dict() | strip for i in outcome.incidents] for outcome, _ in (here, there)]
     assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("apart", ["process", "none"])
+def test_messages_come_as_before_when_one_agent_is_frozen(fmu: Path, apart: Any) -> None:
+    """What was drawn for the rest of a slice is neither drawn again nor left out."""
+    how = attrs.evolve(isolation("freeze"), mode=apart)
+    channel = Channel.uniform(3, 0.05, delay=0.05, jitter=0.1, loss=0.3)
+    system = attrs.evolve(faulty_system(until=10.0), channel=channel, seed=4)
+    seen = []
+    for loop in ("c", "numpy"):
+        rows: list[np.ndarray] = []
+        with faulty_plant(fmu, {1: values("error", at=4.0)}, how) as plant:
+            choice = engine.choose(system.law, loop)
+            outcome = engine.run(
+                system, plant, lambda _, v, to=rows: to.append(v["u"].copy()), choice=choice
+            )
+        assert [i.action for i in outcome.incidents] == ["frozen"]
+        seen.append((np.concatenate(rows), outcome.lost))
+    np.testing.assert_allclose(seen[0][0], seen[1][0], rtol=1e-10, atol=1e-12)
+    assert seen[0][1] == seen[1][1]
 
 
 @pytest.mark.parametrize("action", ["stop", "freeze", "restart"])

@@ -11,6 +11,8 @@ import numpy as np
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 
+Steps = np.ndarray[Any, np.dtype[np.int64]]
+
 
 @attrs.frozen(eq=False)
 class Channel:
@@ -21,7 +23,7 @@ class Channel:
     delay : (arcs,) array of int
         Communication steps that every message takes.
     jitter : (arcs,) array of int
-        Largest additional delay, drawn for each message alike likely.
+        Largest additional delay; each one up to it is alike likely, for each message anew.
     loss : (arcs,) array
         Probability that a message does not arrive.
     resolution : float
@@ -80,6 +82,23 @@ class Channel:
         """Longest delay of a message that arrives [steps]."""
         return int((self.delay + self.jitter).max(initial=0))
 
+    def drawn(
+        self, random: np.random.Generator, steps: int, loss: Array
+    ) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], np.ndarray[Any, np.dtype[np.int64]]]:
+        """Draw what becomes of the messages of some steps, the same however steps are divided.
+
+        Returns
+        -------
+        (steps, arcs) array of bool, (steps, arcs) array of int
+            Whether each message arrives, and how many steps later it would.
+        """
+        arcs = len(self.delay)
+        if not self.jitter.any():
+            arrives = random.random((steps, arcs)) >= loss
+            return arrives, np.broadcast_to(self.delay, (steps, arcs))
+        draws = random.random((steps, 2, arcs))
+        return draws[:, 0] >= loss, self.delay + (draws[:, 1] * (self.jitter + 1)).astype(np.int64)
+
 
 @attrs.define(eq=False)
 class Mailbox:
@@ -129,9 +148,8 @@ class Mailbox:
             return message
         loss = self.channel.loss if loss is None else loss
         arcs = np.arange(len(message))
-        arrives = self.random.random(len(message)) >= loss
-        extra = self.random.integers(0, self.channel.jitter + 1)
-        due = k + self.channel.delay + extra
+        arrives, later = self.channel.drawn(self.random, 1, loss)
+        arrives, due = arrives[0], k + later[0]
         self.lost += int((~arrives).sum())
         for when in np.unique(due[arrives]):
             chosen = arcs[arrives & (due == when)]
@@ -152,7 +170,7 @@ class Mailbox:
 
 @attrs.define(eq=False)
 class Arrivals:
-    """What a `Mailbox` with the same seed would deliver, step after step, without the contents.
+    """What a `Mailbox` with the same seed would deliver, for many steps at once, without contents.
 
     Parameters
     ----------
@@ -163,19 +181,32 @@ class Arrivals:
     ----------
     lost : (steps,) array of int
         Messages lost in each step of the last draw.
+
+    Examples
+    --------
+    >>> channel = Channel.uniform(2, h=0.1, delay=0.2)
+    >>> Arrivals(channel, np.random.default_rng(1)).draw(0, 4)  # the first arrive after two steps
+    array([[-1, -1],
+           [-1, -1],
+           [ 2,  2],
+           [ 2,  2]], dtype=int32)
     """
 
     channel: Channel
     random: np.random.Generator
-    lost: np.ndarray[tuple[int], np.dtype[np.int64]] = attrs.field(init=False)
-    _stamp: np.ndarray[tuple[int], np.dtype[np.int64]] = attrs.field(init=False)
-    _due: dict[int, list[tuple[np.ndarray[Any, np.dtype[np.intp]], int]]] = attrs.field(
-        factory=dict, init=False
-    )
+    lost: Steps = attrs.field(init=False)
+    _end: int = attrs.field(default=0, init=False)  # what is drawn ends here
+    _ages: np.ndarray[tuple[int, int], np.dtype[np.int32]] = attrs.field(init=False)  # up to there
+    _lost: Steps = attrs.field(init=False)
+    _taken: Steps = attrs.field(init=False)  # (arcs,) when the newest that has arrived was sent
+    _coming: Steps = attrs.field(init=False)  # and that which arrives so many steps after the end
 
     def __attrs_post_init__(self) -> None:
-        self._stamp = np.full(len(self.channel.delay), -1)
-        self.lost = np.zeros(0, dtype=np.int64)
+        arcs = len(self.channel.delay)
+        self._ages = np.empty((0, arcs), dtype=np.int32)
+        self._taken = np.full(arcs, -1)
+        self._coming = np.full((self.channel.longest, arcs), -1)
+        self.lost = self._lost = np.zeros(0, dtype=np.int64)
 
     def draw(
         self, begin: int, end: int, loss: Array | None = None
@@ -185,7 +216,9 @@ class Arrivals:
         Parameters
         ----------
         begin, end : int
-            Steps, end not included; begin where the last draw ended.
+            Steps, end not included; begin is not after the end of the last draw, and not before
+            its beginning. What is drawn stays as it is, when a run stops before the end of a
+            draw and goes on from there.
         loss : (arcs,) array, optional
             Probability of loss in these steps; default that of the channel.
 
@@ -193,21 +226,58 @@ class Arrivals:
         -------
         (end - begin, arcs) array of int
         """
-        arcs = len(self._stamp)
-        loss = self.channel.loss if loss is None else loss
-        ages = np.full((end - begin, arcs), -1, dtype=np.int32)
-        self.lost = np.zeros(end - begin, dtype=np.int64)
-        for row, k in enumerate(range(begin, end)):
-            # the same two draws as in Mailbox.exchange
-            arrives = self.random.random(arcs) >= loss
-            due = k + self.channel.delay + self.random.integers(0, self.channel.jitter + 1)
-            self.lost[row] = arcs - int(arrives.sum())
-            for when in np.unique(due[arrives]):
-                self._due.setdefault(int(when), []).append(
-                    (np.flatnonzero(arrives & (due == when)), k)
-                )
-            for chosen, sent_at in self._due.pop(k, []):
-                newer = chosen[self._stamp[chosen] < sent_at]
-                self._stamp[newer] = sent_at
-                ages[row, newer] = k - sent_at
-        return ages
+        rows = len(self._ages) - (self._end - begin)  # that are behind
+        self._ages, self._lost = self._ages[rows:], self._lost[rows:]
+        if end > self._end:
+            ages, lost = self._drawn(self._end, end, self.channel.loss if loss is None else loss)
+            self._ages = np.concatenate([self._ages, ages])
+            self._lost = np.concatenate([self._lost, lost])
+            self._end = end
+        self.lost = self._lost[: end - begin]
+        return self._ages[: end - begin]
+
+    def _drawn(self, begin: int, end: int, loss: Array) -> tuple[Steps, Steps]:
+        steps, sent_at = end - begin, np.arange(begin, end)[:, None]
+        arrives, later = self.channel.drawn(self.random, steps, loss)
+        newest = np.full((steps + len(self._coming), len(self._taken)), -1)  # of each arrival
+        newest[: len(self._coming)] = self._coming
+        for delay in np.flatnonzero(np.bincount(later.ravel()))[::-1]:  # the newer last
+            np.copyto(newest[delay : delay + steps], sent_at, where=arrives & (later == delay))
+        self._coming = newest[steps:].copy()
+        # with jitter an older message may come after a newer one: it is dropped
+        taken = np.maximum.accumulate(np.concatenate([self._taken[None], newest[:steps]]))
+        self._taken = taken[-1].copy()
+        ages = np.where(newest[:steps] > taken[:-1], sent_at - newest[:steps], -1)
+        return ages.astype(np.int32), (~arrives).sum(axis=1)
+
+    def state(self) -> dict[str, Any]:
+        """Return what is under way where the last draw ended, and the random numbers, for JSON."""
+        steps, arcs = np.nonzero(self._coming >= 0)
+        return {
+            "random": self.random.bit_generator.state,
+            "taken": self._taken.tolist(),
+            "coming": np.stack([steps, arcs, self._coming[steps, arcs]], axis=1).tolist(),
+        }
+
+    def restore(self, k: int, state: dict[str, Any]) -> None:
+        """Go on from step k with what `state` returned there.
+
+        Raises
+        ------
+        InputError
+            If it is of another channel.
+        """
+        try:
+            taken = np.array(state["taken"], dtype=np.int64)
+            coming = np.array(state["coming"], dtype=np.int64).reshape(-1, 3).T
+            if taken.shape != self._taken.shape or (coming < 0).any():
+                raise ValueError(f"{taken.size} arcs, here {self._taken.size}")
+            self._coming[:] = -1
+            self._coming[coming[0], coming[1]] = coming[2]
+            self.random.bit_generator.state = state["random"]
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise InputError(
+                f"the snapshot is of another channel or version ({error}): run from the start"
+            ) from None
+        self._taken, self._end = taken, k
+        self._ages, self._lost = self._ages[:0], self._lost[:0]

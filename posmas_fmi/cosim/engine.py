@@ -28,7 +28,7 @@ from posmas_fmi.cosim.master import (
     simulate,
 )
 from posmas_fmi.cosim.plant import Plant
-from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, arrivals_state, set_arrivals
+from posmas_fmi.cosim.snapshot import Snapshot, Snapshots
 from posmas_fmi.errors import BuildError, FmuEndedError, InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.interrupt import Interrupt
@@ -508,7 +508,7 @@ class Engine:
         if not self._plant.shows_states:
             wanted.pop("x", None)
         row = 8 * sum(int(np.prod(shape)) for shape in wanted.values()) + 8
-        other = 0 if self._arrivals is None else 4 * self._e.all_arcs
+        other = 0 if self._arrivals is None else 48 * self._e.all_arcs  # and what a draw needs
         other += 8 * self._e.drives
         other += 8 * n * system.measured if self._noise else 0
         self._room = int(max(1, min(BLOCK // (row + other), system.clock.steps + 1)))
@@ -630,7 +630,7 @@ class Engine:
             "lost": self._lost,
         }
         if self._arrivals is not None:
-            counts["arrivals"] = arrivals_state(self._arrivals)
+            counts["arrivals"] = self._arrivals.state()
         arrays = {name: self._keep[name].copy() for name in STATE if name in self._keep}
         return Snapshot(int(self._e.k), arrays, counts, self._plant.serialise())
 
@@ -652,7 +652,7 @@ class Engine:
         self._largest_initial, self._observed = counts["largest_initial"], counts["observed"]
         self._sent, self._lost = counts["sent"], counts["lost"]
         if self._arrivals is not None:
-            set_arrivals(self._arrivals, counts["arrivals"])
+            self._arrivals.restore(k, counts["arrivals"])
         self._set_conditions(max(k - 1, 0))
 
     def _slices(

@@ -12,7 +12,6 @@ import attrs
 import numpy as np
 
 from posmas_fmi.bounded import require_regular
-from posmas_fmi.cosim.channel import Arrivals
 from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 from posmas_fmi.writing import whole
@@ -141,29 +140,6 @@ class Snapshots:
             )
         if worst > 0:
             log.warning("run again, the FMUs do not repeat themselves: up to %.2g apart", worst)
-
-
-def arrivals_state(arrivals: Arrivals) -> dict[str, Any]:
-    """Return what is under way in a channel, for JSON."""
-    due = [
-        [when, sent_at, [int(arc) for arc in arcs]]
-        for when, entries in arrivals._due.items()
-        for arcs, sent_at in entries
-    ]
-    return {
-        "random": arrivals.random.bit_generator.state,
-        "stamp": [int(value) for value in arrivals._stamp],
-        "due": due,
-    }
-
-
-def set_arrivals(arrivals: Arrivals, state: dict[str, Any]) -> None:
-    """Go back to what `arrivals_state` returned."""
-    arrivals.random.bit_generator.state = state["random"]
-    arrivals._stamp[:] = state["stamp"]
-    arrivals._due.clear()
-    for when, sent_at, arcs in state["due"]:
-        arrivals._due.setdefault(when, []).append((np.array(arcs, dtype=np.intp), sent_at))
 
 
 def newest(folder: Path, at_most: int) -> Path | None:
