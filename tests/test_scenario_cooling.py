@@ -166,6 +166,19 @@ def test_what_a_scenario_says_itself_counts_more(row, tmp_path) -> None:
     assert changed.plant.parameters["UA"] == row.plant.parameters["UA"]
 
 
+def test_what_a_scenario_says_of_a_line_counts_more_and_has_its_number(row, tmp_path) -> None:
+    path = tmp_path / "row.toml"
+    own = "[[plant.override]]\nagent = 3\nevery = 1\nparameters = {UA = 5e3}\n"
+    path.write_text(ROW + own, encoding="utf-8")
+    changed, generated = load(str(path)), {o.agent: o.parameters for o in row.plant.override}
+    assert set(generated) == {2, 3}  # other sizes than the first
+    told = [(o.agent, o.parameters) for o in changed.plant.override]
+    assert told == [(3, generated[3] | {"UA": 5e3}), (2, generated[2])]
+    path.write_text(ROW + own.replace("agent = 3", "agent = 4"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"\$.plant.override\[0\].agent: expected 1 to 3"):
+        load(str(path))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -9,7 +9,7 @@ import types
 import typing
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import attrs
 import cattrs
@@ -127,7 +127,24 @@ def _expand(
         more = expand(**parts, folder=path.parent, integral=_integral(document.get("design")))
     except PosmasError as error:
         raise ScenarioError(tuple(error.problems), str(path)) from None
-    return merged(more, document)
+    both, plant = merged(more, document), document.get("plant")
+    own = plant.get("override") if isinstance(plant, dict) else None
+    if _tables(own):
+        both["plant"]["override"] = _beside(more["plant"]["override"], own)
+    return both
+
+
+def _beside(generated: list[dict[str, Any]], own: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Lay what is written for agents over what is generated for them.
+
+    Those that are written come first: errors tell their number in the file.
+    """
+    rest = {entry["agent"]: entry for entry in generated}
+    written = []
+    for entry in own:
+        agent = entry.get("agent")
+        written.append(merged(rest.pop(agent, {}) if isinstance(agent, int) else {}, entry))
+    return [*written, *rest.values()]
 
 
 def _depth_exceeds(value: Any, most: int) -> bool:
@@ -169,7 +186,7 @@ def merged(tables: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _tables(value: Any) -> bool:
+def _tables(value: Any) -> TypeGuard[list[dict[str, Any]]]:
     return isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
 
 
