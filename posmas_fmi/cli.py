@@ -47,8 +47,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         command: Callable[[argparse.Namespace], int] = arguments.command
         return command(arguments)
     except PosmasError as error:
-        print(f"posmas-fmi: {error}", file=sys.stderr)
+        # what is found while a run begins, or runs, knows its place but not the file
+        file = getattr(arguments, "scenario", "") if error.where.startswith("$") else ""
+        print(f"posmas-fmi: {file}{file and ': '}{error}", file=sys.stderr)
         return error.exit_code
+    except MemoryError as error:
+        print(
+            f"posmas-fmi: there is not enough memory ({error}); fewer agents, shorter delays, or "
+            "fewer variables or communication points to record need less",
+            file=sys.stderr,
+        )
+        return PosmasError.exit_code
     except KeyboardInterrupt:
         if argv is None:  # this process ends now, and another Ctrl-C adds nothing
             signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -101,6 +101,21 @@ def test_pins_are_placed_where_the_scenario_leaves_them_open(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["pinned"] == ["2"]
 
 
+def test_errors_that_come_late_name_the_file_as_well(tmp_path, capsys, monkeypatch):
+    text = (resources.shipped("models") / "paper_example_1.toml").read_text(encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace('"u[1]"', '{variable = "u[1]", unit = "K"}'), encoding="utf-8")
+    assert main(["run", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith(f"posmas-fmi: {path}: $.plant.inputs: ")
+
+    def too_much(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 33 GiB")
+
+    monkeypatch.setattr("posmas_fmi.cosim.engine.run", too_much)
+    assert main(["run", "paper_example_1", "--out", str(tmp_path / "out")]) == 2
+    assert "not enough memory (Unable to allocate 33 GiB); fewer" in capsys.readouterr().err
+
+
 def test_report_is_made_again_from_what_is_stored(tmp_path, capsys):
     main([*SHORT, "--out", str(tmp_path)])
     first = (tmp_path / "report.html").read_bytes()

@@ -636,6 +636,15 @@ def test_arrivals_are_those_of_the_mailbox(seed: int, delay: int, jitter: int, l
     assert lost == mailbox.lost - before
 
 
+@pytest.mark.parametrize("options", [{"delay": 1e300}, {"jitter": 2.0, "loss": 0.2}])
+def test_messages_that_come_after_the_end_take_no_room(options: dict, cache: Path) -> None:
+    case = Case(until=0.5, **options)
+    here, there = (run(case, cache, which) for which in ("c", "numpy"))
+    assert here[0].lost == there[0].lost
+    for name, values in here[1].items():
+        np.testing.assert_allclose(values, there[1][name], rtol=1e-12, atol=1e-12)
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4), st.integers(0, 3))
 def test_messages_are_on_their_way_as_long_as_the_channel_says(
     seed: int, jitter: int, delay: int

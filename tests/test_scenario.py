@@ -67,6 +67,12 @@ MISTAKES = {
     "name": ('"paper-example-1"', '"../up"', ["$.scenario.name"], "folder"),
     "fmi": ('fmu = "positive_agent"', 'fmu = "positive_agent"\nfmi = 1', ["$.plant.fmi"], "2 or 3"),
     "channel": ("[leader]", "[channel]\nloss = 2.0\n[leader]", ["$.channel.loss"], "[0, 1]"),
+    "channel, twice": (
+        "[leader]",
+        "[channel]\nloss = 2.0\ndelay = -1.0\n[leader]",
+        ["$.channel.delay", "$.channel.loss"],
+        "expected a time >= 0 s (got -1.0)",
+    ),
     "override": (
         "[leader]",
         "[[plant.override]]\nagent = 9\n[leader]",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import attrs
@@ -12,6 +13,7 @@ from posmas_fmi.errors import InputError
 from posmas_fmi.expression import Array
 
 Steps = np.ndarray[Any, np.dtype[np.int64]]
+NEVER = 10**15  # steps
 
 
 @attrs.frozen(eq=False)
@@ -28,12 +30,15 @@ class Channel:
         Probability that a message does not arrive.
     resolution : float
         Messages are rounded to multiples of it; 0: they are not.
+    end : int
+        Delays of more steps count as this many: such messages arrive after the end of the run.
     """
 
     delay: np.ndarray[tuple[int], np.dtype[np.int64]]
     jitter: np.ndarray[tuple[int], np.dtype[np.int64]]
     loss: Array
     resolution: float = 0.0
+    end: int = NEVER
 
     @classmethod
     def uniform(
@@ -50,21 +55,27 @@ class Channel:
         Raises
         ------
         InputError
-            If a delay is negative or the loss not in [0, 1].
+            If a delay is negative or the loss not in [0, 1]; `problems` has all of them.
 
         Examples
         --------
         >>> Channel.uniform(2, h=0.1, delay=0.25).delay
         array([3, 3])
         """
-        for name, value in (("delay", delay), ("jitter", jitter)):
-            if not 0.0 <= value < math.inf:
-                raise InputError(f"expected a time >= 0 s (got {value!r})", f"$.channel.{name}")
-        if not 0.0 <= resolution < math.inf:
-            raise InputError(f"expected a number >= 0 (got {resolution!r})", "$.channel.resolution")
-        if not 0.0 <= loss <= 1.0:
-            raise InputError(f"expected a probability in [0, 1] (got {loss!r})", "$.channel.loss")
-        steps = [math.ceil(round(value / h, 9)) for value in (delay, jitter)]
+        found = [
+            InputError(f"expected {what} (got {value!r})", f"$.channel.{name}")
+            for name, value, most, what in (
+                ("delay", delay, sys.float_info.max, "a time >= 0 s"),
+                ("jitter", jitter, sys.float_info.max, "a time >= 0 s"),
+                ("resolution", resolution, sys.float_info.max, "a number >= 0"),
+                ("loss", loss, 1.0, "a probability in [0, 1]"),
+            )
+            if not 0.0 <= value <= most
+        ]
+        if found:
+            found[0].problems = tuple((error.where, error.message) for error in found)
+            raise found[0]
+        steps = [math.ceil(min(round(value / h, 9), NEVER)) for value in (delay, jitter)]
         return cls(
             np.full(arcs, steps[0]),
             np.full(arcs, steps[1]),
@@ -80,7 +91,7 @@ class Channel:
     @property
     def longest(self) -> int:
         """Longest delay of a message that arrives [steps]."""
-        return int((self.delay + self.jitter).max(initial=0))
+        return min(int((self.delay + self.jitter).max(initial=0)), self.end)
 
     def drawn(
         self, random: np.random.Generator, steps: int, loss: Array
@@ -94,10 +105,12 @@ class Channel:
         """
         arcs = len(self.delay)
         if not self.jitter.any():
-            arrives = random.random((steps, arcs)) >= loss
-            return arrives, np.broadcast_to(self.delay, (steps, arcs))
-        draws = random.random((steps, 2, arcs))
-        return draws[:, 0] >= loss, self.delay + (draws[:, 1] * (self.jitter + 1)).astype(np.int64)
+            arrives, later = random.random((steps, arcs)) >= loss, self.delay
+        else:
+            draws = random.random((steps, 2, arcs))
+            arrives = draws[:, 0] >= loss
+            later = self.delay + (draws[:, 1] * (self.jitter + 1)).astype(np.int64)
+        return arrives, np.broadcast_to(np.minimum(later, self.end), (steps, arcs))
 
 
 @attrs.define(eq=False)

@@ -393,13 +393,14 @@ class Engine:
         leader_arc[list(network.pinned)] = network.adjacency.nnz + np.arange(len(network.pinned))
         self._point("leader_arc", leader_arc, np.int64)
         self._set_weights(law.weights)
-        e.slots = system.channel.longest + 2
+        channel = attrs.evolve(system.channel, end=system.clock.steps + 1)
+        e.slots = channel.longest + 2
         self._arrivals = None
         self._draws_loss = system.timeline.has("loss")
-        if system.channel.jitter.any() or system.channel.loss.any() or self._draws_loss:
-            self._arrivals = Arrivals(system.channel, np.random.default_rng(system.seed))
-        elif system.channel.delay.any():
-            self._point("delay", system.channel.delay, np.int64)
+        if channel.jitter.any() or channel.loss.any() or self._draws_loss:
+            self._arrivals = Arrivals(channel, np.random.default_rng(system.seed))
+        elif channel.delay.any():
+            self._point("delay", np.minimum(channel.delay, channel.end), np.int64)
         self._define_wiring()
 
     def _define_wiring(self) -> None:
