@@ -17,10 +17,11 @@ import h5py
 import numpy as np
 import pytest
 
-from posmas_fmi.cosim.recorder import Layout, Recorder, written_rows
+from posmas_fmi.cosim.recorder import Layout, Recorder
 from posmas_fmi.errors import InputError, ResultsError
 from posmas_fmi.fmu.build import write
 from posmas_fmi.fmu.scratch import Scratch, sweep
+from posmas_fmi.netcdf import recorded
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.scenario.folder import occupied
 
@@ -51,7 +52,7 @@ def readable(path: Path) -> int:
     """Number of rows: those that have a time are right, and all that follow are missing."""
     with h5py.File(path, "r") as file:
         times = file["time"][:]
-        rows = written_rows(times)
+        rows = recorded(times)
         assert np.isnan(times[rows:]).all()
         np.testing.assert_array_equal(times[:rows], np.arange(rows))
         for name in ("x", "u"):
@@ -170,7 +171,7 @@ def test_ctrl_c_ends_the_command_and_leaves_nothing_half_done(
     if (out / "results.nc").exists():
         with h5py.File(out / "results.nc") as file:
             assert not file.attrs["complete"].any()
-            assert np.isfinite(file["x"][: written_rows(file["time"][:])]).all()
+            assert np.isfinite(file["x"][: recorded(file["time"][:])]).all()
 
 
 def test_parts_of_builds_that_were_killed_are_removed_by_a_later_one(tmp_path: Path) -> None:

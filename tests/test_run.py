@@ -307,7 +307,8 @@ def test_without_control_is_recorded_beside_the_run(ran):
 
 def test_results_are_readable_while_they_are_written(tmp_path):
     """What is held in memory is bounded: a crash loses the last of it at most."""
-    from posmas_fmi.cosim.recorder import CHUNK, Layout, Recorder, written_rows
+    from posmas_fmi.cosim.recorder import CHUNK, Layout, Recorder
+    from posmas_fmi.netcdf import recorded
     from posmas_fmi.network import network_from_arcs
 
     network = network_from_arcs(1, [], [1])
@@ -318,7 +319,7 @@ def test_results_are_readable_while_they_are_written(tmp_path):
     copy = tmp_path / "copy.nc"
     copy.write_bytes((tmp_path / "r.nc").read_bytes())
     with h5py.File(copy) as file:
-        assert written_rows(file["time"][:]) >= CHUNK
+        assert recorded(file["time"][:]) >= CHUNK
         assert file["u"][CHUNK - 1, 0, 0] == CHUNK - 1
     recorder.close()
     with h5py.File(tmp_path / "r.nc") as file:
@@ -349,6 +350,7 @@ def test_what_is_recorded_can_be_chosen_and_thinned(tmp_path):
 
 def test_the_recorder_writes_before_it_holds_much(tmp_path, monkeypatch):
     from posmas_fmi.cosim import recorder
+    from posmas_fmi.netcdf import recorded
     from posmas_fmi.network import network_from_arcs
 
     monkeypatch.setattr(recorder, "HELD", 10 * 8 * 200)
@@ -359,7 +361,7 @@ def test_the_recorder_writes_before_it_holds_much(tmp_path, monkeypatch):
         for k in range(25):
             one.record(float(k), {"x": np.full((100, 2), k)})
         with h5py.File(tmp_path / "r.nc", "r") as file:
-            assert recorder.written_rows(file["time"][:]) in (10, 20)  # or 20 are being written
+            assert recorded(file["time"][:]) in (10, 20)  # or 20 are being written
         one.flush()
         with h5py.File(tmp_path / "r.nc", "r") as file:
-            assert recorder.written_rows(file["time"][:]) == 25
+            assert recorded(file["time"][:]) == 25

@@ -18,7 +18,7 @@ import numpy as np
 
 from posmas_fmi.errors import InputError, ResultsError
 from posmas_fmi.expression import Array
-from posmas_fmi.netcdf import read_netcdf
+from posmas_fmi.netcdf import read_netcdf, recorded
 from posmas_fmi.network import Network
 from posmas_fmi.writing import whole
 
@@ -386,18 +386,6 @@ class Recorder:
         self.close()
 
 
-def written_rows(time: Array) -> int:
-    """Return how many rows of a result are there: those from its start that have a time.
-
-    Examples
-    --------
-    >>> written_rows(np.array([0.0, 0.1, np.nan]))
-    2
-    """
-    missing = np.flatnonzero(np.isnan(time))
-    return int(missing[0]) if missing.size else len(time)
-
-
 def _check(path: Path, shapes: dict[str, tuple[int, ...]], keep: int) -> dict[str, int]:
     """See that one can go on after so many rows of a file; return where its variables begin."""
     what = "cannot go on with these results"
@@ -408,7 +396,7 @@ def _check(path: Path, shapes: dict[str, tuple[int, ...]], keep: int) -> dict[st
     found = file.variables
     missing = [n for n, shape in shapes.items() if n not in found or found[n].shape[1:] != shape]
     time = found["time"].numbers if "time" in found else None
-    rows = 0 if time is None else written_rows(time)
+    rows = 0 if time is None else recorded(time)
     if missing or rows < keep:
         there = f"no {missing[0]}" if missing else f"{rows} rows"
         raise InputError(
@@ -513,7 +501,7 @@ def write_csv(results: Path, path: Path) -> None:
             for name in names
             for coordinates in product(*(labels[d] for d in signals[name].dimensions[1:]))
         )
-        rows = written_rows(file["time"][...])
+        rows = recorded(file["time"][...])
         width = sum(int(np.prod(signals[name].shape[1:])) for name in names)
         block = max(1, HELD // (64 * width))  # numbers take more room as text
         for begin in range(0, rows, block):

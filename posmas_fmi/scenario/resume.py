@@ -11,10 +11,9 @@ import attrs
 import numpy as np
 
 from posmas_fmi.bounded import require_regular
-from posmas_fmi.cosim.recorder import written_rows
 from posmas_fmi.cosim.snapshot import Snapshot, Snapshots, newest
 from posmas_fmi.errors import InputError
-from posmas_fmi.netcdf import read_netcdf
+from posmas_fmi.netcdf import read_netcdf, recorded
 from posmas_fmi.scenario.build import Scenario
 
 FOLDER = "snapshots"
@@ -200,4 +199,4 @@ def _rows(path: Path) -> tuple[int, bool]:
             f"cannot go on with these results: {error.message}; start the run anew", str(path)
         ) from None
     time = file.variables["time"].numbers if "time" in file.variables else None
-    return (0 if time is None else written_rows(time)), bool(np.all(file.attrs.get("complete", 0)))
+    return (0 if time is None else recorded(time)), bool(np.all(file.attrs.get("complete", 0)))
