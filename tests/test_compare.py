@@ -83,7 +83,7 @@ def test_a_comparison_from_its_table_to_the_next_one(
     assert not [path for path in content(tmp_path) if path.parent.name == "out"]
     told = capsys.readouterr().err
     place = "$.controllers.two.python: step of agent 1 at t = 0.5 s"
-    assert f"posmas-fmi: {place}: ValueError: enough (law.py, line 8)" in told
+    assert f"one.toml: {place}: ValueError: enough (law.py, line 8)" in told
     assert "Traceback" not in told
 
     assert run(tmp_path, scenario(tmp_path, "gian = 0.5")) == 2
