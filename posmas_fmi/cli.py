@@ -111,7 +111,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.outside,
     )
     if arguments.schedule:
-        from posmas_fmi.scenario.job import scheduled
+        from posmas_fmi.scenario.main_job import scheduled
 
         schedule = scheduled(scenario)
         if arguments.json:

@@ -23,7 +23,7 @@ from posmas_fmi.errors import InputError
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.scenario.compare import together
-from posmas_fmi.scenario.job import scheduled
+from posmas_fmi.scenario.main_job import scheduled
 from posmas_fmi.scenario.tables import CompareTable
 
 H, STEPS = 0.1, 20

@@ -18,7 +18,7 @@ from posmas_fmi.errors import FmuError, InputError
 from posmas_fmi.fmu import start_values
 from posmas_fmi.fmu.file import FmuFile
 from posmas_fmi.fmu.start_values import StartValues, read_back, settable, spread
-from posmas_fmi.scenario.job import scheduled
+from posmas_fmi.scenario.main_job import scheduled
 
 PUMP = """
 from pythonfmu import Fmi2Causality as C, Fmi2Initial as I, Fmi2Slave, Fmi2Variability as V

@@ -14,7 +14,7 @@ from posmas_fmi import load
 from posmas_fmi.cli import main
 from posmas_fmi.errors import InputError
 from posmas_fmi.fmu.about import read_about
-from posmas_fmi.scenario.job import scheduled
+from posmas_fmi.scenario.main_job import scheduled
 from posmas_fmi.scenario.schedule import followed, schedule_of
 
 

@@ -92,7 +92,7 @@ def run_comparison(
     folder : Path
         Gets a folder for each controller, ``summary.json`` and the page of key figures.
     progress : callable, optional
-        As in `posmas_fmi.scenario.job.run`; steps are counted over all runs.
+        As in `posmas_fmi.scenario.main_job.run`; steps are counted over all runs.
     command : str, optional
     report : bool, optional
 

@@ -1,4 +1,4 @@
-"""One scenario from file to report: design, certify, co-simulate, record, judge."""
+"""One run of a scenario, with its report: design, certify, co-simulate, record, judge."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from posmas_fmi.scenario.faults import describe, make_crashes, make_episodes
 from posmas_fmi.scenario.folder import occupied
 from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, parameters, periods
 from posmas_fmi.scenario.resume import Beginning, branched, forget_snapshots, resumed, snapshots
-from posmas_fmi.scenario.schedule import Schedule, make_schedule, schedule_of
+from posmas_fmi.scenario.schedule import make_schedule
 from posmas_fmi.scenario.verdict import not_about, summarise
 from posmas_fmi.writing import whole
 
@@ -106,64 +106,6 @@ def pinned_network(scenario: Scenario) -> tuple[Network, tuple[str, ...]]:
     return network, (placement.note(network.names),)
 
 
-def run(
-    scenario: Scenario,
-    folder: Path,
-    progress: Callable[[str], Progress | None] = lambda label: None,
-    command: str = "",
-    report: bool = True,
-    resume: bool = False,
-    branch: tuple[Path, float] | None = None,
-) -> RunResult:
-    """Run a scenario and write everything to a folder.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    folder : Path
-        Made if needed; files of an earlier run in it are replaced.
-    progress : callable, optional
-        Gets a label, returns a progress function for that part or None.
-    command : str, optional
-        For the manifest.
-    report : bool, optional
-        Whether to write report.html as well.
-    resume : bool
-        Go on with the run in the folder, which ended early: from its last snapshot, or, without
-        one, from its start.
-    branch : (Path, float), optional
-        Folder of another run and the time [s] of one of its snapshots, from which this one begins.
-
-    Returns
-    -------
-    RunResult
-
-    Raises
-    ------
-    PosmasError
-        If nothing could be run. A run that diverges or whose FMU fails is no error but a verdict,
-        and what was recorded is kept.
-    """
-    integral = scenario.design.method == "integral" or scenario.design.K_q is not None
-    if integral and scenario.cooling is None:
-        raise InputError(
-            "a run simulates the protocol without integrals: 'design' and 'certify' work for this "
-            'method, and the law "integral" of a cooling row runs such gains',
-            "$.design.method",
-        )
-    if scenario.compare is not None:
-        if resume or branch:
-            raise InputError("a comparison cannot go on; run one of its controllers", "$.compare")
-        from posmas_fmi.scenario.compare import run_comparison
-
-        return run_comparison(scenario, folder, progress, command, report)
-    make_instances(scenario, fmu_files(scenario), extras(scenario))  # its mistakes come first
-    designed = make_design_of(scenario)
-    return run_designed(
-        scenario, designed, folder, progress, command, report, resume=resume, branch=branch
-    )
-
-
 def run_designed(
     scenario: Scenario,
     designed: Design,
@@ -175,7 +117,7 @@ def run_designed(
     branch: tuple[Path, float] | None = None,
     started: Callable[[], None] = lambda: None,
 ) -> RunResult:
-    """Run a scenario with a design that is there already; see `run`.
+    """Run a scenario with a design that is there already; see `posmas_fmi.scenario.main_job.run`.
 
     `started` is called when all FMUs run, before anything of an earlier run is given up.
     """
@@ -422,22 +364,6 @@ def extras(scenario: Scenario) -> tuple[str, ...]:
     from posmas_fmi.cooling.control import EXTRAS
 
     return EXTRAS
-
-
-def scheduled(scenario: Scenario) -> Schedule:
-    """Return what a run of a scenario will do; of a comparison, that with its first controller.
-
-    Raises
-    ------
-    PosmasError
-        As `posmas_fmi.scenario.schedule.schedule_of`.
-    """
-    if scenario.compare is not None:
-        from posmas_fmi.scenario.compare import controllers
-
-        control = next(iter(controllers(scenario).values()))
-        scenario = attrs.evolve(scenario, compare=None, control=control)
-    return schedule_of(scenario, extras(scenario))
 
 
 def law_network(scenario: Scenario, designed: Design) -> Network:
