@@ -53,6 +53,16 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
                 "a bounded disturbance of at most half the resolution; certificate G gives a band",
             )
         )
+    sensors = scenario.sensors
+    if sensors is not None and (sensors.noise.any() or sensors.resolution.any()):
+        rows.append(
+            (
+                "sensors with noise or steps",
+                False,
+                "what they add enters through E; for a bounded disturbance certificate G gives a "
+                "band",
+            )
+        )
     if any(o.every > 1 for o in scenario.plant.override):
         rows.append(
             ("longer periods of some agents", False, "certificate T is about one period for all")
