@@ -161,7 +161,7 @@ def test_rounded_messages_and_delays_say_what_is_covered(tmp_path: Path) -> None
 def test_noise_of_sensors(tmp_path: Path, plain: Any) -> None:
     summary, data = result(tmp_path, "[sensors]\nnoise = [0.05, 0.1]\n")
     assert [(row["what"], row["covered"]) for row in summary["coverage"]] == [
-        ("sensors with noise or steps", False)
+        ("noise or quantisation of sensors", False)
     ]
     assert plain[0]["coverage"] == []
     assert np.abs(data["xhat"] - plain[1]["xhat"]).max() > 1e-3

@@ -66,26 +66,30 @@ class Propagator:
         )
 
     @cached_property
+    def weights_of_g(self) -> tuple[Array, ...]:
+        """With H in them: over half a step, then at the start, the middle and the end of a step."""
+        return tuple(W @ self.H for W in (self.half_gamma, self.start, self.middle, self.end))
+
+    @cached_property
     def stages(self) -> tuple[Array, Array, Array, Array]:
         """Matrices of the stages a, b, c and of the end, (m, 3m) to (m, 6m).
 
         Each is a linear combination of the columns of x, w and of g at x, a, b and c.
         """
         A, G, zero = self.half, self.half_gamma, np.zeros_like(self.half)
-        GH, base = G @ self.H, [A, G]
+        GH, start, middle, end = self.weights_of_g
+        base = [A, G]
         a = np.hstack([*base, GH])
         b = np.hstack([*base, zero, GH])
         # A a + G (2 H g(b) - H g(x) + w)
         c = np.hstack([A @ A, A @ G + G, A @ GH - GH, zero, 2.0 * GH])
-        of_g = [part @ self.H for part in (self.start, self.middle, self.middle, self.end)]
-        return a, b, c, np.hstack([self.full, self.gamma, *of_g])
+        return a, b, c, np.hstack([self.full, self.gamma, start, middle, middle, end])
 
     @property
     def in_c(self) -> tuple[Array, ...]:
         """The matrices (m, m) of csrc/protocol/controller.h, from ``full`` on."""
-        half_g = self.half_gamma @ self.H
-        of_g = (part @ self.H for part in (self.start, self.middle, self.end))
-        return self.full, self.half, self.gamma, self.half_gamma, half_g, 2.0 * half_g, *of_g
+        half_g, *of_step = self.weights_of_g
+        return self.full, self.half, self.gamma, self.half_gamma, half_g, 2.0 * half_g, *of_step
 
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""

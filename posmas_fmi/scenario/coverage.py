@@ -57,7 +57,7 @@ def coverage(scenario: Scenario, designed: Design) -> list[dict[str, Any]]:
     if sensors is not None and (sensors.noise.any() or sensors.resolution.any()):
         rows.append(
             (
-                "sensors with noise or steps",
+                "noise or quantisation of sensors",
                 False,
                 "what they add enters through E; for a bounded disturbance certificate G gives a "
                 "band",
