@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,21 @@ def test_a_fast_mode_that_does_not_count_does_not_set_the_period(tmp_path: Path)
     assert report_of(path, ["u"], ["y"], **values)["period"]["suggested"] == 0.1
     values["C"] = [[1.0, 1000.0]]  # as large as the slow one
     assert report_of(path, ["u"], ["y"], **values)["period"]["suggested"] == 1e-4
+
+
+def test_the_period_is_one_that_a_run_takes(tmp_path: Path) -> None:
+    """The linear model is that of Model Exchange; a run uses Co-Simulation, which allows less."""
+    made, stepped = agent("u1", tmp_path, 1), tmp_path / "stepped.fmu"
+    with zipfile.ZipFile(made) as good, zipfile.ZipFile(stepped, "w") as copy:
+        for name in good.namelist():
+            content = good.read(name)
+            if name == "modelDescription.xml":
+                fixed = b'<CoSimulation fixedInternalStepSize="0.25" '
+                content = content.replace(b"<CoSimulation ", fixed)
+            copy.writestr(name, content)
+    period = check_fmu(stepped).results["control"]["period"]
+    assert period["suggested"] == 0.25
+    assert "the FMU takes 0.25 s" in period["reason"]
 
 
 def test_an_fmu_that_shows_no_states_is_sampled() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from posmas_fmi.errors import PosmasError
 from posmas_fmi.expression import Array
+from posmas_fmi.fmu.about import About
 from posmas_fmi.fmu.agent_toml import plant_toml
 from posmas_fmi.fmu.evaluation import Signals, Values, bring_to, default_step, signals
 from posmas_fmi.fmu.file import FmuFile
@@ -32,7 +33,12 @@ _STEPS = 5
 
 
 def control_report(
-    file: FmuFile, inputs: Sequence[str], outputs: Sequence[str], at: float, values: Values
+    file: FmuFile,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    at: float,
+    values: Values,
+    run_as: About | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Go through the parts of the report, each as soon as it is known.
 
@@ -45,6 +51,8 @@ def control_report(
         Time of the operating point [s].
     values : mapping
         Parameters, start values and inputs.
+    run_as : About, optional
+        The FMU by the interface that a run uses, where `file` is another: its periods count.
 
     Yields
     ------
@@ -57,7 +65,7 @@ def control_report(
         return
     made = linearise_open(file, names, at, values, None)
     yield {"linear": made.to_dict(), "signs": signs(made)}
-    yield {**modes(made), "unseen": unseen(made), "period": period(made, file)}
+    yield {**modes(made), "unseen": unseen(made), "period": period(made, file, run_as)}
     fitted, why = _fitted(file, names, made, at, values)
     if fitted is None:
         yield {
@@ -142,11 +150,11 @@ def modes(made: Linearisation) -> dict[str, Any]:
     }
 
 
-def period(made: Linearisation, file: FmuFile) -> dict[str, Any]:
+def period(made: Linearisation, file: FmuFile, run_as: About | None = None) -> dict[str, Any]:
     """Return a control period to begin with [s], and why.
 
     A tenth of the shortest time constant among the modes that the inputs move and the outputs
-    show, rounded down to 1, 2 or 5; or what the FMU allows nearest to that.
+    show, rounded down to 1, 2 or 5; or what the FMU, as it is run, allows nearest to that.
     """
     sizes = _weights(made)
     poles = _continuous(made)
@@ -157,7 +165,7 @@ def period(made: Linearisation, file: FmuFile) -> dict[str, Any]:
         shortest = 1 / max(counting)
         h = _rounded(shortest / _PER_CONSTANT)
         why = f"a tenth of {shortest:.3g} s, the shortest time constant that counts"
-    allowed = check_period(file, h)
+    allowed = check_period(run_as or file, h)
     if not allowed.allowed and allowed.nearest:
         h, why = allowed.nearest, f"{why}; the FMU takes {allowed.nearest:g} s"
     return {"suggested": h, "reason": why}

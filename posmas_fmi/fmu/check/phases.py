@@ -464,7 +464,8 @@ def control(trial: Trial) -> None:
 
     job, report = trial.job, {}
     with _for_control(trial) as file:
-        for part in control_report(file, job.inputs, job.outputs, trial.t0, job.values):
+        about = trial.file.about
+        for part in control_report(file, job.inputs, job.outputs, trial.t0, job.values, about):
             report.update(part)
             trial.journal.result(control=report)
 
