@@ -1,16 +1,14 @@
 """Other co-simulation masters on the same FMUs: plants alone, and the closed loop on equal terms.
 
-On equal terms a peer runs what the engine runs: the plants, a controller FMU per agent made from
-the engine's own C source (`controller_fmu.c`), a leader FMU, and the arcs of the same digraph as
-connections. These masters step all FMUs from t to t + h and pass outputs on at t + h (Jacobi). So a
-controller acts on y and messages of t, as ours does, but its u reaches the plant at t + h.
+On equal terms a peer runs what the engine runs: the plants, for each agent the controller that
+`posmas-fmi export` writes (the engine's own C source), a leader FMU, and the arcs of the same
+digraph as connections. These masters step all FMUs from t to t + h and pass outputs on at t + h
+(Jacobi). So what agents tell each other takes one period, and so does nothing else.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import io
 import os
 import sys
 import tempfile
@@ -23,13 +21,10 @@ from typing import Any
 import attrs
 import numpy as np
 
-from posmas_fmi.agent import Agent
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System
+from posmas_fmi.export import Controllers, controller_model
 from posmas_fmi.fmu import build
-from posmas_fmi.fmu.compile import host, shared_library
-
-SOURCE = Path(__file__).parent / "controller_fmu.c"
 
 
 class Skip(Exception):  # noqa: N818
@@ -64,10 +59,10 @@ class Loop:
 
 
 def elements(name: str, array: Any) -> dict[str, float]:
-    """Each element of an array by its name."""
+    """Each element of an array by its name; a number by its own."""
     array = np.asarray(array, dtype=float)
     return {
-        f"{name}[{','.join(str(i + 1) for i in index)}]": float(value)
+        f"{name}[{','.join(str(i + 1) for i in index)}]" if index else name: float(value)
         for index, value in np.ndenumerate(array)
     }
 
@@ -84,18 +79,16 @@ def plants_alone(system: System, x0: np.ndarray, cache: Path | None = None) -> L
 
 
 def closed_loop(system: System, x0: np.ndarray, cache: Path | None = None) -> Loop:
-    """The plants with the controllers, the leader and the digraph of a system.
+    """The plants with the controllers, the leader and the digraph of a system, as exported.
 
-    The channel must be ideal and the observer local.
+    The channel must be ideal.
     """
-    law, network, agent = system.law, system.network, system.agent
+    law, agent = system.law, system.agent
     assert isinstance(law, ProtocolLaw)
     assert system.channel.ideal
-    weights = law.weights
-    assert not weights.heard_innovation.nnz
+    made = Controllers(law, system.senders, system.clock.h, system.xhat0, system.s0)
     plants = plants_alone(system, x0, cache)
-    heard = max(1, int(np.diff(network.adjacency.indptr).max(initial=0)))
-    path = controller_fmu(law, system.clock.h, heard, cache)
+    path = build.fmu(controller_model(made), 2, cache=cache)
     fmus: dict[str, Path] = dict(plants.fmus)
     values: dict[str, Mapping[str, float]] = dict(plants.values)
     wires: list[tuple[str, str, str, str]] = []
@@ -105,88 +98,23 @@ def closed_loop(system: System, x0: np.ndarray, cache: Path | None = None) -> Lo
             (source, f"{output}[{j + 1}]", sink, target.format(j + 1)) for j in range(count)
         )
 
-    fmus["s"], values["s"] = path, elements("xhat", system.s0)
-    by_arc = weights.heard.tocsr()
-    for i in range(network.N):
+    def flat(given: Mapping[str, Any]) -> dict[str, float]:
+        return {k: v for name, array in given.items() for k, v in elements(name, array).items()}
+
+    fmus["s"] = build.agent_fmu(agent.g, agent.sec, agent.m, agent.p, agent.m, 2, cache=cache)
+    idle = {"A": agent.A, "H": agent.H, "B": 0 * agent.B, "C": np.eye(agent.m), "x": system.s0}
+    values["s"] = flat(idle)
+    for i, links in enumerate(made.links):
         plant, controller = f"p{i:05}", f"c{i:05}"
-        arcs = by_arc.indices[by_arc.indptr[i] : by_arc.indptr[i + 1]]
-        strength = by_arc.data[by_arc.indptr[i] : by_arc.indptr[i + 1]]
         fmus[controller] = path
-        values[controller] = {
-            "own": float(weights.own[i]),
-            "leader": float(weights.leader[i]),
-            "innovation": float(weights.own_innovation[i]),
-            **elements("weight", strength),
-            **elements("xhat", system.xhat0[i]),
-        }
+        values[controller] = flat({**made.parameters(i), **made.first(i)})
         connect(plant, "y", controller, "y[{}]", agent.q)
         connect(controller, "u", plant, "u[{}]", agent.p)
-        for place, sender in enumerate(system.senders[arcs]):
-            connect(f"c{sender:05}", "xhat", controller, f"heard[{place + 1},{{}}]", agent.m)
-        if i in network.pinned:
-            connect("s", "xhat", controller, "s[{}]", agent.m)
+        for place, sender in enumerate(links.senders):
+            connect(f"c{sender:05}", "sent", controller, f"heard[{place + 1},{{}}]", made.sent)
+        if links.leader:
+            connect("s", "y", controller, "s[{}]", agent.m)
     return Loop(system.clock.h, fmus, values, tuple(wires))
-
-
-def controller_fmu(law: ProtocolLaw, h: float, heard: int, cache: Path | None = None) -> Path:
-    """The FMU of `controller_fmu.c` for one law, period [s] and number of neighbours."""
-    sources = law.sources()
-    own = ("controller.c", "controller.h", "step.h", "lanes.h", "agent_functions.h", "export.h")
-    files = {name: sources.files[name] for name in own}
-    files["fmi2.h"] = (Path(build.__file__).parent / "csrc" / "fmi2.h").read_text(encoding="utf-8")
-    files["controller_fmu.c"] = SOURCE.read_text(encoding="utf-8")
-    constants = ", ".join(value.hex() for value in law.constants(h).tolist())
-    token = hashlib.sha256(f"{files}{constants}{heard}".encode()).hexdigest()[:32]
-    files["controller_data.h"] = (
-        f'#define TOKEN "{token}"\nenum {{ HEARD = {heard} }};\n'
-        f"static const Controller CONTROLLER = {{{constants}}};\n"
-    )
-    folder = (cache or build.cache_folder()) / "controllers"
-    path = folder / f"controller-{token}.fmu"
-    if path.is_file():
-        return path
-    target = host()
-    binary = shared_library(files, ["controller.c", "controller_fmu.c"], "controller", target)
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr("modelDescription.xml", _description(law.agent, heard, token))
-        archive.writestr(f"binaries/{target.fmi2}/controller{target.extension}", binary)
-    build.write(path, content.getvalue())
-    return path
-
-
-def _description(agent: Agent, heard: int, token: str) -> str:
-    m, p, q = agent.m, agent.p, agent.q
-    roles = [
-        ("input", "continuous", ' start="0"', elements("y", np.zeros(q))),
-        ("input", "continuous", ' start="0"', elements("heard", np.zeros((heard, m)))),
-        ("input", "continuous", ' start="0"', elements("s", np.zeros(m))),
-        ("parameter", "tunable", ' start="0"', ["own", *elements("weight", np.zeros(heard))]),
-        ("parameter", "tunable", ' start="0"', ["leader", "innovation"]),
-        ("output", "continuous", ' start="0"', elements("u", np.zeros(p))),
-        ("output", "continuous", ' start="0"', elements("xhat", np.zeros(m))),
-    ]
-    rows, outputs, number = [], [], 0
-    for causality, variability, start, names in roles:
-        initial = ' initial="exact"' if causality == "output" else ""
-        for name in names:
-            rows.append(
-                f'<ScalarVariable name="{name}" valueReference="{number}" causality="{causality}" '
-                f'variability="{variability}"{initial}><Real{start}/></ScalarVariable>'
-            )
-            number += 1
-            if causality == "output":
-                outputs.append(f'<Unknown index="{number}"/>')
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n'
-        f'<fmiModelDescription fmiVersion="2.0" modelName="controller" guid="{token}">'
-        '<CoSimulation modelIdentifier="controller" '
-        'canHandleVariableCommunicationStepSize="false"/>'
-        f"<ModelVariables>{''.join(rows)}</ModelVariables>"
-        f"<ModelStructure><Outputs>{''.join(outputs)}</Outputs>"
-        f"<InitialUnknowns>{''.join(outputs)}</InitialUnknowns></ModelStructure>"
-        "</fmiModelDescription>"
-    )
 
 
 # ---- the peers -----------------------------------------------------------------------------------

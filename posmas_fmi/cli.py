@@ -228,6 +228,26 @@ def _fmu_build(arguments: argparse.Namespace) -> int:
     return DONE
 
 
+def _export(arguments: argparse.Namespace) -> int:
+    from posmas_fmi.scenario import load
+    from posmas_fmi.scenario.export import export
+
+    scenario = load(arguments.scenario, arguments.period, outside=arguments.outside)
+    folder = arguments.out or Path("out") / f"{scenario.name}-export"
+    made = export(scenario, folder, tuple(arguments.platform))
+    if arguments.json:
+        _print_json(made.to_dict())
+    else:
+        for path in made.files:
+            print(path)
+        if made.no_ssp:
+            print(f"no SSP file: {made.no_ssp}")
+        print(f"certified  {_certified(made.design)}")
+        covers = "covers" if made.delay["covered"] else "does not cover"
+        print(f"           that {covers} messages that take one period, as in other masters")
+    return DONE if made.design.certificate.certified != "no" else NEGATIVE
+
+
 def _regress(arguments: argparse.Namespace) -> int:
     import attrs
 
@@ -573,6 +593,22 @@ def _parser() -> argparse.ArgumentParser:
     build.add_argument(
         "--out", type=Path, metavar="DIR", default=Path("fmus"), help="folder (default fmus)"
     )
+
+    export = add("export", _export, "controllers as FMUs and C, with the plants as SSP")
+    export.add_argument("scenario", help=_SCENARIO)
+    export.add_argument(
+        "--out", type=Path, metavar="DIR", help="output folder (default out/<name>-export)"
+    )
+    export.add_argument("--period", type=_positive, metavar="S", help="control period [s]")
+    export.add_argument(
+        "--platform",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="system that the FMUs are for, as often as needed; default this one",
+    )
+    export.add_argument("--outside", action="store_true", help=outside)
+    export.add_argument("--json", action="store_true", help="print what was written as JSON")
 
     regress = add("regress", _regress, "compare an FMU with a reference result")
     regress.add_argument("fmu", type=Path, metavar="FMU", help="the FMU to run")

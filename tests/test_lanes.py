@@ -195,7 +195,7 @@ def test_blocks_give_the_bits_of_single_agents(example, tmp_path: Path) -> None:
     step = Propagator.of(agent, 0.01)
     random = np.random.default_rng(3)
     matrices = (random.normal(size=(p, m)), random.normal(size=(m, q)), agent.B, agent.C)
-    constants = np.concatenate([[0.01], *(a.ravel() for a in (*matrices, *step.in_c))])
+    constants = np.concatenate([[0.01], *(a.ravel() for a in (*matrices, *step.in_c.values()))])
     disagreement, memory = random.normal(size=(m + q, B)), random.uniform(0, 2, (m, B))
     memory[:, 5] *= 1e8  # beyond the reduction of sin
     driven, t = np.array([1.0] * 15 + [0.0]), ctypes.c_double(0.7)

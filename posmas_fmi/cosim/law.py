@@ -316,9 +316,13 @@ class ProtocolLaw(CompiledLaw):
 
     def constants(self, h: float) -> Array:
         """Return the members of csrc/protocol/controller.h's structure."""
+        return np.concatenate([np.ravel(value) for value in self.members(h).values()])
+
+    def members(self, h: float) -> dict[str, Array]:
+        """Return them by name, in order."""
         agent, protocol = self.agent, self.protocol
-        matrices = (protocol.K, protocol.E, agent.B, agent.C, *self.propagator(h).in_c)
-        return np.concatenate([[h], *(matrix.ravel() for matrix in matrices)])
+        gains = {"h": np.array(h), "K": protocol.K, "E": protocol.E, "B": agent.B, "C": agent.C}
+        return gains | self.propagator(h).in_c
 
     def start(self, xhat0: Array) -> Array:
         """Return the first estimates: that is all an agent remembers."""

@@ -86,10 +86,20 @@ class Propagator:
         return a, b, c, np.hstack([self.full, self.gamma, start, middle, middle, end])
 
     @property
-    def in_c(self) -> tuple[Array, ...]:
-        """The matrices (m, m) of csrc/protocol/controller.h, from ``full`` on."""
-        half_g, *of_step = self.weights_of_g
-        return self.full, self.half, self.gamma, self.half_gamma, half_g, 2.0 * half_g, *of_step
+    def in_c(self) -> dict[str, Array]:
+        """The matrices (m, m) of csrc/protocol/controller.h by name, in order."""
+        half_g, start_g, middle_g, end_g = self.weights_of_g
+        return {
+            "full": self.full,
+            "half": self.half,
+            "gamma": self.gamma,
+            "half_gamma": self.half_gamma,
+            "half_g": half_g,
+            "twice_half_g": 2.0 * half_g,
+            "start_g": start_g,
+            "middle_g": middle_g,
+            "end_g": end_g,
+        }
 
     def __call__(self, t: float, X: Array, W: Array) -> Array:
         """Propagate the rows of X (N, m) from t to t + h with inputs W (N, m) held."""

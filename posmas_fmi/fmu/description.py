@@ -99,10 +99,19 @@ _CAUSALITY = {
     "parameter": {"causality": "parameter", "variability": "tunable", "initial": "exact"},
     "input": {"causality": "input", "variability": "continuous"},
     "state": {"causality": "local", "variability": "continuous", "initial": "exact"},
+    "memory": {"causality": "local", "variability": "continuous", "initial": "calculated"},
     "derivative": {"causality": "local", "variability": "continuous", "initial": "calculated"},
     "output": {"causality": "output", "variability": "continuous", "initial": "calculated"},
     "local": {"causality": "local", "variability": "continuous", "initial": "calculated"},
 }
+
+
+def _causality(model: FmuModel, variable: Variable) -> dict[str, str]:
+    """Return causality, variability and initial; a sampled model's own variables are discrete."""
+    found = _CAUSALITY[variable.role]
+    if model.sampled and variable.role not in ("parameter", "input"):
+        found = {**found, "variability": "discrete"}
+    return found
 
 
 def _value(variable: Variable) -> dict[str, str]:
@@ -110,6 +119,10 @@ def _value(variable: Variable) -> dict[str, str]:
     if variable.role == "state" and variable.nominal != 1.0:
         attributes["nominal"] = repr(variable.nominal)
     return attributes
+
+
+def _true(value: bool) -> str:
+    return "true" if value else "false"
 
 
 def _initial_unknowns(model: FmuModel) -> list[Variable]:
@@ -143,15 +156,13 @@ def _fmi2(model: FmuModel, sources: Sequence[str]) -> ET.Element:
         "canNotUseMemoryManagementFunctions": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
-        "providesDirectionalDerivative": "true",
+        "providesDirectionalDerivative": _true(not model.sampled),
     }
-    exchange = ET.SubElement(
-        root, "ModelExchange", {**common, "completedIntegratorStepNotNeeded": "true"}
-    )
-    simulation = ET.SubElement(
-        root, "CoSimulation", {**common, "canHandleVariableCommunicationStepSize": "true"}
-    )
-    for interface in (exchange, simulation):
+    if not model.sampled:
+        ET.SubElement(root, "ModelExchange", {**common, "completedIntegratorStepNotNeeded": "true"})
+    varies = {"canHandleVariableCommunicationStepSize": _true(not model.sampled)}
+    ET.SubElement(root, "CoSimulation", {**common, **varies})
+    for interface in list(root):
         files = ET.SubElement(interface, "SourceFiles")
         for name in sources:
             ET.SubElement(files, "File", name=name)
@@ -171,7 +182,7 @@ def _fmi2(model: FmuModel, sources: Sequence[str]) -> ET.Element:
                     "name": name,
                     "valueReference": str(references[variable.name] + k),
                     "description": variable.description,
-                    **_CAUSALITY[variable.role],
+                    **_causality(model, variable),
                 },
             )
             value = ET.SubElement(scalar, "Real", _value(variable))
@@ -221,12 +232,12 @@ def _fmi3(model: FmuModel) -> ET.Element:
         "modelIdentifier": model.name,
         "canGetAndSetFMUState": "true",
         "canSerializeFMUState": "true",
-        "providesDirectionalDerivatives": "true",
+        "providesDirectionalDerivatives": _true(not model.sampled),
     }
-    ET.SubElement(root, "ModelExchange", {**common, "needsCompletedIntegratorStep": "false"})
-    ET.SubElement(
-        root, "CoSimulation", {**common, "canHandleVariableCommunicationStepSize": "true"}
-    )
+    if not model.sampled:
+        ET.SubElement(root, "ModelExchange", {**common, "needsCompletedIntegratorStep": "false"})
+    varies = {"canHandleVariableCommunicationStepSize": _true(not model.sampled)}
+    ET.SubElement(root, "CoSimulation", {**common, **varies})
     _units(root, model)
     _log_categories(root)
     _experiment(root, model)
@@ -251,7 +262,7 @@ def _fmi3(model: FmuModel) -> ET.Element:
                 "name": variable.name,
                 "valueReference": str(references[variable.name]),
                 "description": variable.description,
-                **_CAUSALITY[variable.role],
+                **_causality(model, variable),
                 **_value(variable),
             },
         )

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from typing import Literal
+from typing import Literal, get_args
 
 import attrs
 
 from posmas_fmi.errors import BuildError
 
-Role = Literal["parameter", "input", "state", "derivative", "output", "local"]
-ROLES: tuple[Role, ...] = ("parameter", "input", "state", "derivative", "output", "local")
+Role = Literal["parameter", "input", "state", "memory", "derivative", "output", "local"]
+ROLES: tuple[Role, ...] = get_args(Role)
 
 
 @attrs.frozen
@@ -23,8 +23,9 @@ class Variable:
     ----------
     name : str
         As importers see it.
-    role : {"parameter", "input", "state", "derivative", "output", "local"}
-        Parameters are tunable; the derivative of a state is added by `FmuModel`.
+    role : {"parameter", "input", "state", "memory", "derivative", "output", "local"}
+        Parameters are tunable; the derivative of a state is added by `FmuModel`. Memory is what a
+        sampled model keeps besides its states and computes itself, from the start on.
     shape : tuple of int
         ``()`` for a scalar. Arrays are one variable in FMI 3 and one per element in FMI 2.
     start : tuple of float
@@ -126,19 +127,23 @@ class FmuModel:
     variables : tuple of Variable
         Without time and derivatives, which are added.
     code : mapping of str to str
-        The model's own C files by name; they define the three functions of ``model.h``.
+        The model's own C files by name; they define the functions of ``model.h``.
     experiment : Experiment
+    period : float, optional
+        [s] Of a sampled model: its states change at communication points only, which are one
+        period apart, and it has Co-Simulation only. Left out: the states have derivatives.
 
     Attributes
     ----------
     table : tuple of Variable
-        All variables but time in the order of their values: parameters, inputs, states,
+        All variables but time in the order of their values: parameters, inputs, states, memory,
         derivatives, outputs and locals.
 
     Raises
     ------
     BuildError
-        If the name is no C identifier or a variable name occurs twice.
+        If the name is no C identifier, a variable name occurs twice, or the roles of variables do
+        not fit the kind of the model.
     """
 
     name: str
@@ -146,6 +151,7 @@ class FmuModel:
     variables: tuple[Variable, ...]
     code: Mapping[str, str]
     experiment: Experiment = Experiment()
+    period: float | None = None
     table: tuple[Variable, ...] = attrs.field(init=False)
 
     @table.default
@@ -159,17 +165,19 @@ class FmuModel:
                 unit=_per_second(v.unit),
                 description=f"Derivative of {v.name}",
             )
-            for v in states
+            for v in (() if self.sampled else states)
         ]
-        given = {
-            role: [v for v in self.variables if v.role == role] for role in ("parameter", "input")
-        }
+        first = [v for role in ROLES[:4] for v in self.variables if v.role == role]
         computed = [v for v in self.variables if v.role in ("output", "local")]
-        return (*given["parameter"], *given["input"], *states, *derivatives, *computed)
+        return (*first, *derivatives, *computed)
 
     def __attrs_post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", self.name):
             raise BuildError(f"expected a C identifier as the model's name (got {self.name!r})")
+        if self.period is not None and not (math.isfinite(self.period) and self.period > 0):
+            raise BuildError(f"expected a period > 0 s (got {self.period!r})", self.name)
+        if not self.sampled and self.count("memory"):
+            raise BuildError("only a sampled model has memory: it needs a period", self.name)
         names = ["time", *(name for v in self.table for name in v.elements)]
         twice = {name for name in names if names.count(name) > 1}
         if twice:
@@ -181,6 +189,11 @@ class FmuModel:
                 raise BuildError(
                     f"depends on {', '.join(sorted(unknown))}, not an input or state", variable.name
                 )
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the states change at communication points only."""
+        return self.period is not None
 
     def count(self, *roles: Role) -> int:
         """Return the number of values of these roles."""

@@ -13,7 +13,7 @@ from posmas_fmi.fmu.model import FmuModel
 FmiVersion = Literal[2, 3]
 
 _CSRC = Path(__file__).parent / "csrc"
-_COMMON = ("model.h", "instance.h", "instance.c", "solver.h", "solver.c", "export.h")
+_COMMON = ("model.h", "instance.h", "instance.c", "advance.h", "export.h")
 
 
 def sources(model: FmuModel, fmi: FmiVersion) -> dict[str, str]:
@@ -57,6 +57,7 @@ def instantiation_token(model: FmuModel, fmi: FmiVersion) -> str:
                 model.experiment.step,
                 model.experiment.tolerance,
             ],
+            "period": model.period,
             "sources": sorted(_own(model, fmi).items()),
         }
     )
@@ -65,7 +66,8 @@ def instantiation_token(model: FmuModel, fmi: FmiVersion) -> str:
 
 
 def _own(model: FmuModel, fmi: FmiVersion) -> dict[str, str]:
-    names = (*_COMMON, f"fmi{fmi}.h", f"fmi{fmi}.c")
+    inside = "sampled.c" if model.sampled else "solver.c"
+    names = (*_COMMON, inside, f"fmi{fmi}.h", f"fmi{fmi}.c")
     return {name: (_CSRC / name).read_text(encoding="utf-8") for name in names} | dict(model.code)
 
 
@@ -78,7 +80,10 @@ def _data(model: FmuModel, token: str) -> str:
 #define MODEL_TOKEN "{token}"
 #define MODEL_NP {model.count("parameter")}
 #define MODEL_NU {model.count("input")}
-#define MODEL_NX {model.count("state")}
+#define MODEL_NX {model.count("state", "memory")}
+#define MODEL_NM {model.count("memory")}
+#define MODEL_SAMPLED {int(model.sampled)}
+#define MODEL_PERIOD {model.period or 0.0!r}
 #define MODEL_NY {model.count("output", "local")}
 
 #endif
@@ -91,7 +96,7 @@ def _table(model: FmuModel) -> str:
         start += [repr(value) for value in variable.start] or ["0.0"] * variable.size
         size += [str(variable.size)] + ["0"] * (variable.size - 1)
         names += [f'"{element}"' for element in variable.elements]
-        if variable.role == "state":
+        if variable.role in ("state", "memory"):
             nominal += [repr(variable.nominal)] * variable.size
     return "\n\n".join(
         [

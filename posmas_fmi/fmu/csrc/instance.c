@@ -8,7 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "solver.h"
+#include "advance.h"
 
 /* Times of the importer and of the instance may differ by rounding, and by no part of a step that
  * would matter. */
@@ -80,6 +80,10 @@ Instance *instance_new(const Instance *first, const char *token, Kind kind, int 
         instance_log(first, STATUS_ERROR, "the instance name is missing");
         return NULL;
     }
+    if (MODEL_SAMPLED && kind == MODEL_EXCHANGE) {
+        instance_log(first, STATUS_ERROR, "this FMU has no Model Exchange");
+        return NULL;
+    }
     size_t length = strlen(first->name) + 1;
     Instance *c = calloc(1, sizeof *c + length);
     if (!c) {
@@ -129,6 +133,15 @@ Status instance_initialised(Instance *c)
 {
     if (instance_expect(c, "ExitInitializationMode", MODE_INITIALISING) != STATUS_OK)
         return STATUS_ERROR;
+#if MODEL_SAMPLED
+    double *v = c->state.v;
+    const char *why = model_begin(v + AT_P, v + AT_U, v + AT_X);
+    if (why) {
+        instance_log(c, STATUS_ERROR, "it cannot start: %s", why);
+        return STATUS_ERROR;
+    }
+    c->state.y_known = 0;
+#endif
     c->state.mode = c->kind == CO_SIMULATION ? MODE_STEP : MODE_EVENT;
     return STATUS_OK;
 }
@@ -156,11 +169,15 @@ static Status expect_finite(const Instance *c, unsigned at, unsigned n, Status s
 
 static void know_derivatives(Instance *c)
 {
+#if MODEL_SAMPLED
+    (void)c; /* it has none */
+#else
     double *v = c->state.v;
     if (c->state.dx_known)
         return;
     model_derivatives(v[AT_TIME], v + AT_P, v + AT_U, v + AT_X, v + AT_DX);
     c->state.dx_known = 1;
+#endif
 }
 
 static void know_outputs(Instance *c)
@@ -168,6 +185,10 @@ static void know_outputs(Instance *c)
     double *v = c->state.v;
     if (c->state.y_known)
         return;
+#if MODEL_SAMPLED
+    if (c->state.mode == MODE_INITIALISING)
+        model_begin(v + AT_P, v + AT_U, v + AT_X); /* with what is set by now */
+#endif
     model_outputs(v[AT_TIME], v + AT_P, v + AT_U, v + AT_X, v + AT_Y);
     c->state.y_known = 1;
 }
@@ -225,7 +246,7 @@ static int settable(const Instance *c, uint32_t vr)
 {
     switch (c->state.mode) {
     case MODE_INSTANTIATED:
-    case MODE_INITIALISING: return vr >= AT_P && vr < AT_DX;
+    case MODE_INITIALISING: return vr >= AT_P && vr < AT_DX - MODEL_NM;
     case MODE_EVENT:
     case MODE_STEP: return vr >= AT_P && vr < AT_X;
     case MODE_CONTINUOUS: return vr >= AT_U && vr < AT_X;
@@ -266,6 +287,20 @@ Status instance_set(Instance *c, const uint32_t vr[], size_t n, const double val
     }
     return done == n_values ? STATUS_OK : wrong_count(c, n_values);
 }
+
+#if MODEL_SAMPLED
+
+Status instance_directional(Instance *c, const uint32_t unknown[], size_t n_unknown,
+                            const uint32_t known[], size_t n_known, const double seed[],
+                            size_t n_seed, double result[], size_t n_result)
+{
+    (void)unknown, (void)n_unknown, (void)known, (void)n_known, (void)seed, (void)n_seed;
+    (void)result, (void)n_result;
+    instance_log(c, STATUS_ERROR, "this FMU has no directional derivatives");
+    return STATUS_ERROR;
+}
+
+#else
 
 Status instance_directional(Instance *c, const uint32_t unknown[], size_t n_unknown,
                             const uint32_t known[], size_t n_known, const double seed[],
@@ -319,6 +354,8 @@ Status instance_directional(Instance *c, const uint32_t unknown[], size_t n_unkn
     return done == n_result ? STATUS_OK : wrong_count(c, n_result);
 }
 
+#endif
+
 /* ---- Co-Simulation ----------------------------------------------------------------------- */
 
 Status instance_step(Instance *c, double time, double step)
@@ -346,7 +383,7 @@ Status instance_step(Instance *c, double time, double step)
         s->v[AT_TIME] = time;
         s->dx_known = 0;
     }
-    const char *why = solver_advance(c, time + step);
+    const char *why = instance_advance(c, time + step);
     s->y_known = 0;
     if (why) {
         instance_log(c, STATUS_ERROR, "the step from %.17g to %.17g failed: %s", time, time + step,

@@ -3,7 +3,7 @@
  *
  * The seventh slope of an accepted step is the first of the next, so a step costs six evaluations,
  * and a seventh where an input or parameter changed in between. */
-#include "solver.h"
+#include "advance.h"
 
 #include <float.h>
 #include <math.h>
@@ -100,7 +100,7 @@ static double growth(double error)
     return fmin(5, fmax(0.2, 0.9 * pow(error, -0.2)));
 }
 
-const char *solver_advance(Instance *c, double end)
+const char *instance_advance(Instance *c, double end)
 {
     State *s = &c->state;
     double *x = s->v + AT_X, t = s->v[AT_TIME];

@@ -28,6 +28,12 @@ void controller_step(const Controller *c, const double *own, double t, const dou
          (Lanes(*)[M])next, (Lanes(*)[P])u, (Lanes(*)[P])applied, &range);
 }
 
+void controller_input(const Controller *c, const double *disagreement, double *u, double *applied)
+{
+    LanesRange range = {.mends = 1};
+    input(c, (const Lanes *)disagreement, (Lanes *)u, (Lanes *)applied, &range);
+}
+
 void controller_leader(const Controller *c, double t, const double *memory, double *next)
 {
     const Lanes none[1][M] = {{0}};

@@ -56,7 +56,10 @@ void controller_step(const Controller *c, const double *own, double t, const dou
                      const double *disagreement, const double *silence, const double *memory,
                      double *next, double *u, double *applied);
 
-/* The same for many agents at once, to the same bits: columns are agents, so disagreement is
+/* Only the input: u (P) = K disagreement, and applied = sec(u). */
+void controller_input(const Controller *c, const double *disagreement, double *u, double *applied);
+
+/* controller_step for many agents at once, to the same bits: columns are agents, so disagreement is
  * (MESSAGE, CONTROLLER_BLOCK). All columns are to hold numbers, those of the first `agents` count.
  * Where `driven` (CONTROLLER_BLOCK) is 0 and not 1 the model runs free: there is room for the leader.
  * A controller without this function is called for one agent at a time. */

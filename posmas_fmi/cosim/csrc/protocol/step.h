@@ -76,6 +76,14 @@ LANES_INLINE void propagate(const int groups, const Controller *c, double t, con
     }
 }
 
+/* Equation (6): u = K disagreement, and what the saturation makes of it. */
+LANES_INLINE void input(const Controller *c, const Lanes *disagreement, Lanes *u, Lanes *applied,
+                        LanesRange *range)
+{
+    set_product(u, c->K, disagreement, P, M);
+    agent_sec(u, applied, range);
+}
+
 /* As controller_step, for all lanes of some vectors; what is held counts `driven` times. */
 LANES_INLINE void step(const int groups, const Controller *c, double t, const Lanes *driven,
                        const Lanes disagreement[][MESSAGE], const Lanes memory[][M],
@@ -83,8 +91,7 @@ LANES_INLINE void step(const int groups, const Controller *c, double t, const La
 {
     Lanes held[GROUPS][M];
     for (int k = 0; k < groups; k++) {
-        set_product(u[k], c->K, disagreement[k], P, M);
-        agent_sec(u[k], applied[k], range);
+        input(c, disagreement[k], u[k], applied[k], range);
         set_product(held[k], c->E, disagreement[k] + M, M, Q);
         add_product(held[k], c->B, applied[k], M, P);
         for (int i = 0; i < M; i++)

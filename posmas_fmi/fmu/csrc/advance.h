@@ -1,6 +1,7 @@
-/* The solver inside the Co-Simulation interface. */
-#ifndef SOLVER_H
-#define SOLVER_H
+/* What happens inside a step of the Co-Simulation interface: `solver.c` integrates a model that has
+ * derivatives, `sampled.c` lets one that is sampled act. A model is compiled with one of them. */
+#ifndef ADVANCE_H
+#define ADVANCE_H
 
 #include "instance.h"
 
@@ -11,6 +12,6 @@
 
 /* Brings the instance to `end` exactly. NULL, or why that cannot be done; then the state is as it
  * was before. */
-const char *solver_advance(Instance *c, double end);
+const char *instance_advance(Instance *c, double end);
 
 #endif

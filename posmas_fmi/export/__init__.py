@@ -1,0 +1,17 @@
+"""Controllers to take away: as an FMU, as C, and with the plants in an SSP file."""
+
+from posmas_fmi.export.c_code import c_files
+from posmas_fmi.export.controller import Controllers, Links, controller_model
+from posmas_fmi.export.ssp import Component, Connection, Connector, Structure, ssp
+
+__all__ = [
+    "Component",
+    "Connection",
+    "Connector",
+    "Controllers",
+    "Links",
+    "Structure",
+    "c_files",
+    "controller_model",
+    "ssp",
+]
