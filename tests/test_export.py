@@ -19,6 +19,7 @@ import pytest
 import xarray
 from fmpy.validation import validate_fmu
 from lxml import etree
+from test_fmu_instance import described
 
 from posmas_fmi import load, run
 from posmas_fmi.agent import linear_agent
@@ -377,15 +378,9 @@ def test_it_goes_back_to_a_saved_state(local: Made) -> None:
 
 def test_a_sampled_fmu_has_no_model_exchange(local: Made, tmp_path: Path) -> None:
     """Whatever its description were made to say."""
-    forged = tmp_path / "forged.fmu"
-    made = zipfile.ZipFile(local.folder / "controller-fmi3.fmu")
-    with made as good, zipfile.ZipFile(forged, "w") as bad:
-        for name in good.namelist():
-            content = good.read(name)
-            if name == "modelDescription.xml":
-                more = b'<ModelExchange modelIdentifier="controller"/><CoSimulation '
-                content = content.replace(b"<CoSimulation ", more)
-            bad.writestr(name, content)
+    more = b'<ModelExchange modelIdentifier="controller"/><CoSimulation '
+    made, to = local.folder / "controller-fmi3.fmu", tmp_path / "forged.fmu"
+    forged = described(made, to, b"<CoSimulation ", more)
     with ModelExchangeFile(forged) as file, pytest.raises(FmuError, match="no Model Exchange"):
         file.instantiate("x")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tomllib
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from fmu_examples import tank_fmu
 from test_fmu_events import only_me
+from test_fmu_instance import described
 
 from posmas_fmi import load
 from posmas_fmi.cli import main
@@ -120,14 +120,9 @@ def test_a_fast_mode_that_does_not_count_does_not_set_the_period(tmp_path: Path)
 
 def test_the_period_is_one_that_a_run_takes(tmp_path: Path) -> None:
     """The linear model is that of Model Exchange; a run uses Co-Simulation, which allows less."""
-    made, stepped = agent("u1", tmp_path, 1), tmp_path / "stepped.fmu"
-    with zipfile.ZipFile(made) as good, zipfile.ZipFile(stepped, "w") as copy:
-        for name in good.namelist():
-            content = good.read(name)
-            if name == "modelDescription.xml":
-                fixed = b'<CoSimulation fixedInternalStepSize="0.25" '
-                content = content.replace(b"<CoSimulation ", fixed)
-            copy.writestr(name, content)
+    fixed = b'<CoSimulation fixedInternalStepSize="0.25" '
+    made, to = agent("u1", tmp_path, 1), tmp_path / "stepped.fmu"
+    stepped = described(made, to, b"<CoSimulation ", fixed)
     period = check_fmu(stepped).results["control"]["period"]
     assert period["suggested"] == 0.25
     assert "the FMU takes 0.25 s" in period["reason"]

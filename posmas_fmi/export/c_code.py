@@ -85,7 +85,7 @@ def _links(parameters: Mapping[str, Array]) -> str:
 
 def _table(head: str, rows: Sequence[str], names: Sequence[str]) -> str:
     lines = [
-        f"    {row}, /* {name.replace('*/', '* /')} */"
+        f"    {row}, /* {name.replace('*/', '* /').replace('/*', '/ *')} */"
         for row, name in zip(rows, names, strict=True)
     ]
     return "\n".join([f"static {head} = {{", *lines, "};"])
