@@ -24,6 +24,7 @@ import numpy as np
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.cosim.master import System
 from posmas_fmi.export import Controllers, controller_model
+from posmas_fmi.export import values as values_of
 from posmas_fmi.fmu import build
 
 
@@ -81,11 +82,12 @@ def plants_alone(system: System, x0: np.ndarray, cache: Path | None = None) -> L
 def closed_loop(system: System, x0: np.ndarray, cache: Path | None = None) -> Loop:
     """The plants with the controllers, the leader and the digraph of a system, as exported.
 
-    The channel must be ideal.
+    The channel must be ideal and the observer local.
     """
     law, agent = system.law, system.agent
     assert isinstance(law, ProtocolLaw)
     assert system.channel.ideal
+    assert not law.weights.heard_innovation.nnz
     made = Controllers(law, system.senders, system.clock.h, system.xhat0, system.s0)
     plants = plants_alone(system, x0, cache)
     path = build.fmu(controller_model(made), 2, cache=cache)
@@ -107,11 +109,11 @@ def closed_loop(system: System, x0: np.ndarray, cache: Path | None = None) -> Lo
     for i, links in enumerate(made.links):
         plant, controller = f"p{i:05}", f"c{i:05}"
         fmus[controller] = path
-        values[controller] = flat({**made.parameters(i), **made.first(i)})
+        values[controller] = flat(values_of(made, i))
         connect(plant, "y", controller, "y[{}]", agent.q)
         connect(controller, "u", plant, "u[{}]", agent.p)
         for place, sender in enumerate(links.senders):
-            connect(f"c{sender:05}", "sent", controller, f"heard[{place + 1},{{}}]", made.sent)
+            connect(f"c{sender:05}", "sent", controller, f"heard[{place + 1},{{}}]", agent.m)
         if links.leader:
             connect("s", "y", controller, "s[{}]", agent.m)
     return Loop(system.clock.h, fmus, values, tuple(wires))

@@ -24,6 +24,7 @@ from test_fmu_instance import described
 from posmas_fmi import load, run
 from posmas_fmi.agent import linear_agent
 from posmas_fmi.cli import main
+from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.export import Component, Connection, Connector, Controllers, Structure, ssp
@@ -36,7 +37,11 @@ from posmas_fmi.fmu.model_exchange import ModelExchangeFile
 from posmas_fmi.network import network_from_arcs
 from posmas_fmi.protocol import make_protocol
 from posmas_fmi.resources import shipped
+from posmas_fmi.scenario import Scenario
 from posmas_fmi.scenario.export import Exported, export
+from posmas_fmi.scenario.job import extras, law_network, make_design_of, make_system
+from posmas_fmi.scenario.plant import fmu_files, make_instances
+from posmas_fmi.scenario.tables import ControlTable
 
 TANH = (shipped("models") / "paper_example_1_tanh.toml").read_text(encoding="utf-8")
 STEPS, H = 200, 0.005
@@ -126,27 +131,79 @@ def read(fmi: int, instance: Any, name: str, count: int) -> np.ndarray:
 
 def test_the_c_code_does_what_was_simulated(made: Made, tmp_path: Path) -> None:
     """Without a warning, and the example reads what was measured and writes the inputs."""
-    compiler = find_compiler(host())
-    strict = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off"]
-    program = tmp_path / "network"
-    sources = [str(made.folder / "c" / name) for name in ("network.c", "agent.c", "controller.c")]
-    command = [*compiler.command, *strict, *sources, "-o", str(program), "-lm"]
-    built = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert built.returncode == 0, f"{shlex.join(command)}\n{built.stderr}"
-    run = made.results
-    y = run.y.values[:STEPS].reshape(STEPS, -1)
-    rows = [",".join(map(repr, [k * H, *row])) for k, row in enumerate(y.tolist())]
-    told = "\n".join(["time,measured", *rows, ""])
-    said = subprocess.run([program], input=told, capture_output=True, text=True, check=True).stdout
-    head, *lines = said.splitlines()
-    assert head == "time,agent1.u1,agent2.u1,agent3.u1,agent4.u1"
-    u = np.array([[float(cell) for cell in line.split(",")[1:]] for line in lines])
-    assert np.abs(u - run.u.values[:STEPS, :, 0]).max() < 1e-12 * np.abs(u).max()
+    program = built(made.folder / "c", tmp_path)
+    measured, u = simulated(made.scenario)
+    assert np.abs(inputs_of(program, measured, H) - u).max() < 1e-12 * np.abs(u).max()
     bad = subprocess.run(
         [program], input="h\n0.0,1.0\n", capture_output=True, text=True, check=False
     )
     assert bad.returncode == 1
     assert "expected t and 8 values" in bad.stderr
+
+
+@pytest.mark.parametrize(
+    "law", ["integral", "integral_ff", "proportional", "set_point", "pi", "team"]
+)
+def test_cooling_controllers_in_c(tmp_path: Path, law: str) -> None:
+    """Those of a row with noise, rounded sensors, loads that step and a new set-point."""
+    text = (shipped("models") / "cooling_row.toml").read_text(encoding="utf-8")
+    text = text[: text.index("[channel]")] + f'[compare]\ncontrollers = ["{law}"]\n'
+    scenario = load(written(tmp_path, text), until=4000.0)
+    made = export(scenario, tmp_path / "export", controller=law)
+    assert made.no_fmu == made.no_ssp
+    assert "only the protocol (6) is exported as an FMU" in made.no_fmu
+    assert {path.name for path in made.files} == {"c", "agents.json", "design.json", "README.md"}
+    told = json.loads((made.folder / "agents.json").read_text())
+    assert told["agents"][0]["ports"]["u1"]["variable"] == "valve"
+    assert told["agents"][0]["ports"]["u1"]["scale"] < 0
+    assert list(told["measured"]) == ["power", "valve", "water"]
+    program = built(made.folder / "c", tmp_path)
+    alone = attrs.evolve(scenario, compare=None, control=ControlTable(law))
+    measured, u = simulated(alone)
+    assert np.ptp(u) > 1000  # W
+    assert np.abs(inputs_of(program, measured, 5.0) - u).max() < 1e-9 * np.abs(u).max()
+
+
+def built(folder: Path, to: Path) -> Path:
+    """The example program."""
+    compiler = find_compiler(host())
+    strict = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off"]
+    sources = [str(folder / name) for name in ("network.c", "agent.c", "controller.c")]
+    command = [*compiler.command, *strict, *sources, "-o", str(to / "network"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{shlex.join(command)}\n{done.stderr}"
+    return to / "network"
+
+
+def simulated(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """What the agents measured (steps, N, …) and their inputs, by the engine."""
+    designed = make_design_of(scenario)
+    designed = attrs.evolve(designed, network=law_network(scenario, designed))
+    instances = make_instances(scenario, fmu_files(scenario), extras(scenario))
+    rows: dict[str, list[np.ndarray]] = {"measured": [], "u": []}
+
+    def record(_: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        for name, kept in rows.items():
+            kept.extend(values[name].copy())
+
+    with instances.start(quiet=True) as plant:
+        system = make_system(scenario, designed, instances)
+        choice = engine.choose(system.law, "c")
+        engine.run(system, plant, record, variables=("measured", "u"), choice=choice)
+    return np.array(rows["measured"]), np.array(rows["u"])
+
+
+def inputs_of(program: Path, measured: np.ndarray, h: float) -> np.ndarray:
+    """What the example makes of it, (steps, N, 1)."""
+    steps, agents = measured.shape[:2]
+    lines = measured.reshape(steps, -1).tolist()
+    rows = [",".join(map(repr, [k * h, *line])) for k, line in enumerate(lines)]
+    told = "\n".join(["time,measured", *rows, ""])
+    said = subprocess.run([program], input=told, capture_output=True, text=True, check=True).stdout
+    head, *found = said.splitlines()
+    assert head == "time," + ",".join(f"agent{i + 1}.u1" for i in range(agents))
+    numbers = [[float(cell) for cell in line.split(",")[1:]] for line in found]
+    return np.array(numbers).reshape(steps, agents, 1)
 
 
 def test_ecos_does_with_the_ssp_file_what_was_simulated(local: Made) -> None:
@@ -243,6 +300,7 @@ def test_the_files_keep_to_their_standards(made: Made) -> None:
 
 def test_the_same_scenario_gives_the_same_bytes(local: Made, tmp_path: Path) -> None:
     again = export(local.scenario, tmp_path / "again")
+    assert len(again.files) == 7
     for path in again.files:
         if path.is_file():
             assert path.read_bytes() == (local.folder / path.name).read_bytes(), path.name
@@ -261,7 +319,7 @@ def test_the_preflight_of_an_exported_controller(made: Made) -> None:
 def test_what_the_readme_says_of_the_proof(local: Made, tmp_path: Path) -> None:
     text = (local.folder / "README.md").read_text()
     assert "Certified: yes" in text
-    assert "The certificate covers that: certificate D" in text
+    assert "a period old. The certificate covers that: certificate D" in text
     assert local.exported.delay["covered"] is True
     gains = 'method = "gains"\nK = [[0.0, 0.0]]\nE = [[0.0, 0.0], [0.0, 0.0]]'
     weak = TANH.replace('method = "contraction"', gains)
@@ -401,9 +459,13 @@ def test_only_a_sampled_model_has_memory() -> None:
 
 
 REFUSED = {
-    "printed": ("phi = 10.0", 'phi = 10.0\nprotocol = "printed"', "as printed is unstable"),
+    "printed": (
+        "phi = 10.0",
+        'phi = 10.0\nprotocol = "printed"',
+        "paper prints the network is unstable",
+    ),
     "integral": ('method = "contraction"', 'method = "integral"', "with integrals is not exported"),
-    "own": ("[leader]", '[control]\npython = "own.py:Own"\n[leader]', "are not exported"),
+    "own": ("[leader]", '[control]\npython = "own.py:Own"\n[leader]', "in Python: not exported"),
     "periods": ("[leader]", "[[plant.override]]\nagent = 2\nevery = 2\n[leader]", "period"),
 }
 
@@ -421,11 +483,34 @@ def test_what_is_not_exported(
     assert not (tmp_path / "export").exists()
 
 
-def test_other_laws_and_comparisons_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", "cooling_row"]) == 2
-    assert "$.compare" in capsys.readouterr().err
-    assert main(["export", "cooling_integral"]) == 2
-    assert "not exported" in capsys.readouterr().err
+def test_which_controller_of_a_comparison(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = ["--out", str(tmp_path / "export")]
+    assert main(["export", "cooling_row", *folder]) == 2
+    assert "--controller: choose one of pi, integral, integral_ff" in capsys.readouterr().err
+    assert main(["export", "cooling_row", *folder, "--controller", "pid"]) == 2
+    assert "fixed (got 'pid')" in capsys.readouterr().err
+    assert main(["export", "paper_example_1", *folder, "--controller", "pi"]) == 2
+    assert "the scenario compares no controllers" in capsys.readouterr().err
+    assert not (tmp_path / "export").exists()
+    assert main(["export", "cooling_row", *folder, "--controller", "fixed"]) == 1
+    said = capsys.readouterr().out
+    assert "no FMUs and no SSP file: the input of this law follows" in said
+    assert "certified  no" in said
+    assert "one period" not in said
+    assert "does NOT cover that: nothing is proved" in (tmp_path / "export/README.md").read_text()
+
+
+def test_a_law_that_is_not_there_in_c(tmp_path: Path) -> None:
+    text = (shipped("models") / "cooling_row.toml").read_text(encoding="utf-8")
+    text = text[: text.index("[compare]")] + '[compare]\ncontrollers = ["mpc"]\n'
+    text = text.replace("set_point_step", "# ")  # it knows one set-point only
+    with pytest.raises(InputError, match="the law 'mpc' is not there in C"):
+        export(load(written(tmp_path, text)), tmp_path / "export", controller="mpc")
+    text = text.replace('["mpc"]', '["printed"]')
+    with pytest.raises(InputError, match="the network is unstable"):
+        export(load(written(tmp_path, text)), tmp_path / "export", controller="printed")
 
 
 SUMMED = """
@@ -496,7 +581,7 @@ def test_an_agent_that_hears_nobody_but_the_leader(tmp_path: Path) -> None:
     law = ProtocolLaw(linear_agent([[-1.0]], [[1.0]], [[1.0]]), protocol)
     made = Controllers(law, one.adjacency.indices, 0.1, np.zeros((1, 1)), np.ones(1))
     assert made.heard == 1
-    assert made.parameters(0)["weight"].tolist() == [0.0]
+    assert made.weights(0)["weight"].tolist() == [0.0]
 
 
 def test_python_functions_are_refused() -> None:

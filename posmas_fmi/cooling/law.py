@@ -389,9 +389,10 @@ class CoolingLaw(CompiledLaw):
         """Return the sources of the engine."""
         return engine_sources("cooling", "/* no functions of an agent are needed */\n")
 
-    def constants(self, h: float) -> Array:
+    def members(self, h: float) -> dict[str, Array]:
         """Return the members of csrc/cooling/controller.h's structure."""
-        return np.concatenate([value.ravel() for value in self.at(h).values.values()])
+        values = self.at(h).values.items()
+        return {name: value if value.size > 1 else value[0] for name, value in values}
 
     @property
     def own_values(self) -> Array:

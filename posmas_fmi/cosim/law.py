@@ -230,7 +230,7 @@ class Law(Interface):
         """Return what the leader remembers at t + h."""
 
 
-class CompiledLaw(ABC):
+class CompiledLaw(Law, ABC):
     """What a law needs so that the engine can run it: C sources and the data for them."""
 
     @abstractmethod
@@ -244,8 +244,12 @@ class CompiledLaw(ABC):
         """
 
     @abstractmethod
-    def constants(self, h: float) -> Array:
+    def members(self, h: float) -> dict[str, Array]:
         """Return the members of the structure ``Controller`` for a period h [s], in order."""
+
+    def constants(self, h: float) -> Array:
+        """Return their values one after the other."""
+        return np.concatenate([np.ravel(value) for value in self.members(h).values()])
 
     @property
     def own_values(self) -> Array:
@@ -314,12 +318,8 @@ class ProtocolLaw(CompiledLaw):
         header = functions_header(agent.g, agent.sec, agent.m, agent.p, agent.q, lanes=True)
         return engine_sources("protocol", header)
 
-    def constants(self, h: float) -> Array:
-        """Return the members of csrc/protocol/controller.h's structure."""
-        return np.concatenate([np.ravel(value) for value in self.members(h).values()])
-
     def members(self, h: float) -> dict[str, Array]:
-        """Return them by name, in order."""
+        """Return the members of csrc/protocol/controller.h's structure."""
         agent, protocol = self.agent, self.protocol
         gains = {"h": np.array(h), "K": protocol.K, "E": protocol.E, "B": agent.B, "C": agent.C}
         return gains | self.propagator(h).in_c

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from posmas_fmi.export.controller import CSRC, Controllers, braced
+from posmas_fmi.export.controllers import Controllers, braced
 from posmas_fmi.expression import Array
 
+_CSRC = Path(__file__).parent / "csrc"
 _BUILD = """\
 cmake_minimum_required(VERSION 3.10)
 project(network C)
@@ -39,53 +41,62 @@ def c_files(controllers: Controllers, names: Sequence[str]) -> dict[str, str]:
     Raises
     ------
     InputError
-        If g or sec are Python functions.
+        If the law cannot be had in C.
     """
-    return controllers.files() | {
-        "agents.h": _agents(controllers, names),
-        "network.c": (CSRC / "network.c").read_text(encoding="utf-8"),
-        "CMakeLists.txt": _BUILD,
-    }
+    own = {name: (_CSRC / name).read_text(encoding="utf-8") for name in _OWN}
+    return (
+        controllers.files()
+        | own
+        | {
+            "agents.h": _agents(controllers, names),
+            "CMakeLists.txt": _BUILD,
+        }
+    )
+
+
+_OWN = ("agent.h", "agent.c", "network.c")
 
 
 def _agents(controllers: Controllers, names: Sequence[str]) -> str:
-    links = controllers.links
+    law, links = controllers.law, controllers.links
     senders = [[*one.senders, *[-1] * (controllers.heard - len(one.senders))] for one in links]
-    tables = [
-        _table(
-            "const AgentLinks LINKS[AGENTS]",
-            [_links(controllers.parameters(i)) for i in range(len(links))],
-            names,
-        ),
-        _table(
-            "const int SENDER[AGENTS][HEARD]",
-            [f"{{{', '.join(map(str, row))}}}" for row in senders],
-            names,
-        ),
-        _table("const double START[AGENTS][M]", [braced(x) for x in controllers.xhat0], names),
-        f"static const double S0[M] = {braced(controllers.s0)};",
-    ]
+    own_values = law.own_values
+    values = "static const double *const OWN_VALUES[AGENTS] = {0}; /* all are alike */"
+    if own_values.size:
+        rows = [braced(row) for row in own_values]
+        values = _table("const double OWN_VALUES[AGENTS][OWN]", rows, names)
+    start = [braced(row) for row in law.start(controllers.xhat0)]
     return "\n\n".join(
         [
-            "/* The agents: their weights, whom they hear (from 0; -1: nobody) and their first\n"
-            " * estimates; and the first state of the leader. Generated. */\n"
+            "/* The agents: their weights and own values, whom they hear (from 0; -1: nobody),\n"
+            " * and what they and the leader remember at the start. Generated. */\n"
             "#ifndef AGENTS_H\n#define AGENTS_H\n\n"
             '#include "agent.h"\n\n'
             f"enum {{ AGENTS = {len(links)} }};",
-            *tables,
+            _table(
+                "const AgentLinks LINKS[AGENTS]",
+                [_links(controllers.weights(i)) for i in range(len(links))],
+                names,
+            ),
+            values,
+            _table(
+                "const int SENDER[AGENTS][HEARD]",
+                [f"{{{', '.join(map(str, row))}}}" for row in senders],
+                names,
+            ),
+            _table("const double START[AGENTS][MEMORY]", start, names),
+            f"static const double LEADER[MEMORY] = {braced(law.lead(controllers.s0))};",
             "#endif\n",
         ]
     )
 
 
-def _links(parameters: Mapping[str, Array]) -> str:
-    members = (f".{name} = {braced(value)}" for name, value in parameters.items())
+def _links(weights: Mapping[str, Array]) -> str:
+    members = (f".{name} = {braced(value)}" for name, value in weights.items())
     return f"{{{', '.join(members)}}}"
 
 
 def _table(head: str, rows: Sequence[str], names: Sequence[str]) -> str:
-    lines = [
-        f"    {row}, /* {name.replace('*/', '* /').replace('/*', '/ *')} */"
-        for row, name in zip(rows, names, strict=True)
-    ]
+    plain = [name.replace("*/", "* /").replace("/*", "/ *") for name in names]
+    lines = [f"    {row}, /* {name} */" for row, name in zip(rows, plain, strict=True)]
     return "\n".join([f"static {head} = {{", *lines, "};"])

@@ -1,4 +1,4 @@
-"""The controllers of a scenario to take away: FMUs, C, and an SSP file with the plants."""
+"""The controllers of a scenario to take away: C, FMUs, and an SSP file with the plants."""
 
 from __future__ import annotations
 
@@ -7,19 +7,30 @@ from typing import Any
 
 import attrs
 
-from posmas_fmi.cosim.law import ProtocolLaw
+from posmas_fmi.cosim.fmus import PortMap
+from posmas_fmi.cosim.law import CompiledLaw, ProtocolLaw
 from posmas_fmi.design import Design
 from posmas_fmi.errors import InputError
-from posmas_fmi.export import Controllers, c_files, controller_model, ssp
+from posmas_fmi.export import Controllers, c_files, controller_model, ssp, values
 from posmas_fmi.fmu.build import archive, write
 from posmas_fmi.fmu.compile import PLATFORMS, Platform, host
 from posmas_fmi.scenario.build import Scenario
+from posmas_fmi.scenario.compare import controllers
 from posmas_fmi.scenario.coverage import coverage
 from posmas_fmi.scenario.folder import occupied
-from posmas_fmi.scenario.job import make_design_of, make_law, write_json
-from posmas_fmi.scenario.plant import fmu_files, make_instances, periods
+from posmas_fmi.scenario.job import (
+    extras,
+    facts_of,
+    law_network,
+    make_design_of,
+    make_law,
+    write_json,
+)
+from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, periods
 from posmas_fmi.scenario.structure import structure_of
 from posmas_fmi.writing import whole
+
+_FMUS = ("controller-fmi2.fmu", "controller-fmi3.fmu")
 
 
 @attrs.frozen
@@ -29,22 +40,25 @@ class Exported:
     Attributes
     ----------
     folder : Path
-        With ``controller-fmi2.fmu``, ``controller-fmi3.fmu``, ``agents.json``, ``design.json``,
-        ``README.md``, ``c/`` and, unless there is a reason against it, ``NAME.ssp``.
     design : Design
     files : tuple of Path
-        All of them, folders as a whole.
-    no_ssp : str
-        Why there is no SSP file; empty if there is one.
+        What was written: ``c/``, ``agents.json``, ``design.json`` and ``README.md``; the FMUs and
+        ``NAME.ssp`` unless there is a reason against them.
+    no_fmu, no_ssp : str
+        That reason; empty if they are there.
+    certified : {"yes", "conditional", "no"}
+        Of the law, as in design.json.
     delay : dict
-        Whether the certificate covers that messages take one period, and why: as a row of
+        Whether the certificate covers messages that take one period, and why: as a row of
         `posmas_fmi.scenario.coverage.coverage`.
     """
 
     folder: Path
     design: Design
     files: tuple[Path, ...]
+    no_fmu: str
     no_ssp: str
+    certified: str
     delay: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
@@ -52,14 +66,20 @@ class Exported:
         return {
             "folder": str(self.folder),
             "files": [str(path) for path in self.files],
+            "no_fmu": self.no_fmu,
             "no_ssp": self.no_ssp,
-            "certified": self.design.certificate.certified,
+            "certified": self.certified,
             "delay": self.delay,
         }
 
 
-def export(scenario: Scenario, folder: Path, platforms: tuple[str, ...] = ()) -> Exported:
-    """Design the controllers of a scenario and write them as FMUs, as C and with the plants as SSP.
+def export(
+    scenario: Scenario,
+    folder: Path,
+    platforms: tuple[str, ...] = (),
+    controller: str | None = None,
+) -> Exported:
+    """Design the controllers of a scenario and write them as C, as FMUs and with the plants as SSP.
 
     Parameters
     ----------
@@ -69,6 +89,8 @@ def export(scenario: Scenario, folder: Path, platforms: tuple[str, ...] = ()) ->
     platforms : tuple of str, optional
         For which the controller FMUs are compiled, names of
         `posmas_fmi.fmu.compile.PLATFORMS`; default this machine's.
+    controller : str, optional
+        Which one of a comparison.
 
     Returns
     -------
@@ -77,70 +99,67 @@ def export(scenario: Scenario, folder: Path, platforms: tuple[str, ...] = ()) ->
     Raises
     ------
     InputError
-        If the controllers are not those of the protocol (6), or agents have different periods.
+        If the controllers cannot be had in C, or agents have different periods.
     PosmasError
         If there is no design, or no compiler.
     """
-    _require_protocol(scenario)
+    scenario = _one(scenario, controller)
+    _refuse(scenario)
     targets = _targets(platforms)
-    make_instances(scenario, fmu_files(scenario))  # its mistakes come first
+    instances = make_instances(scenario, fmu_files(scenario), extras(scenario))
     designed = make_design_of(scenario)
     law = make_law(scenario, designed)
-    assert isinstance(law, ProtocolLaw)
-    controllers = Controllers(
-        law,
-        designed.network.adjacency.indices,
-        scenario.clock.h,
-        scenario.xhat0,
-        scenario.s0,
-    )
-    model, names = controller_model(controllers), designed.network.names
+    if not isinstance(law, CompiledLaw):
+        own = scenario.control.law
+        raise InputError(f"the law {own!r} is not there in C, and is not exported", "$.control.law")
+    if (law.weights.leader < 0).any():
+        raise InputError(
+            "with the signs that the paper prints the network is unstable: not exported",
+            "$.design.protocol" if isinstance(law, ProtocolLaw) else "$.control",
+        )
+    network, names = law_network(scenario, designed), designed.network.names
+    senders = network.adjacency.indices
+    program = Controllers(law, senders, scenario.clock.h, scenario.xhat0, scenario.s0)
+    facts = facts_of(scenario, designed)
     with occupied(folder):
-        files = [folder / f"controller-fmi{fmi}.fmu" for fmi in (2, 3)]
-        write(files[0], archive(model, 2, targets))
-        write(files[1], archive(model, 3, targets))
         (folder / "c").mkdir(exist_ok=True)
-        for name, text in c_files(controllers, names).items():
+        for name, text in c_files(program, names).items():
             with whole(folder / "c" / name) as file:
                 file.write(text)
-        system, no_ssp = folder / f"{scenario.name}.ssp", ""
-        try:
-            write(system, ssp(structure_of(scenario, controllers, files[0])))
-            files.append(system)
-        except InputError as error:
-            no_ssp = str(error)
-            system.unlink(missing_ok=True)
-        write_json(folder / "agents.json", _agents(controllers, names))
-        write_json(folder / "design.json", designed.to_dict())
-        made = Exported(
-            folder,
-            designed,
-            (*files, *(folder / name for name in ("c", "agents.json", "design.json", "README.md"))),
-            no_ssp,
-            _delay(scenario, designed),
-        )
+        more, no_fmu, no_ssp = _fmus(scenario, program, folder, targets)
+        agents = _agents(scenario, program, instances, names, bool(more))
+        write_json(folder / "agents.json", agents)
+        write_json(folder / "design.json", facts)
+        last = tuple(folder / name for name in ("agents.json", "design.json", "README.md"))
+        files = (folder / "c", *more, *last)
+        delay = _delay(scenario, designed, facts["certified"])
+        made = Exported(folder, designed, files, no_fmu, no_ssp, facts["certified"], delay)
         with whole(folder / "README.md") as file:
-            file.write(_readme(scenario, controllers, made))
+            file.write(_readme(scenario, program, made))
     return made
 
 
-def _require_protocol(scenario: Scenario) -> None:
-    """Refuse what is not exported."""
-    own = scenario.control.python or scenario.control.law
-    if scenario.compare is not None:
-        raise InputError("a comparison has several controllers; leave [compare] out", "$.compare")
-    if own != "protocol":
-        raise InputError(
-            f"expected the law 'protocol' (got {own!r}): the other laws are not exported",
-            "$.control",
-        )
-    if scenario.design.method == "integral" or scenario.design.K_q is not None:
+def _one(scenario: Scenario, controller: str | None) -> Scenario:
+    """Take one controller of a comparison."""
+    if scenario.compare is None:
+        if controller is not None:
+            raise InputError("the scenario compares no controllers: leave it out", "--controller")
+        return scenario
+    there = controllers(scenario)
+    if controller not in there:
+        known = ", ".join(there)
+        got = "" if controller is None else f" (got {controller!r})"
+        raise InputError(f"choose one of {known}{got}", "--controller")
+    return attrs.evolve(scenario, compare=None, control=there[controller])
+
+
+def _refuse(scenario: Scenario) -> None:
+    """Refuse at once what is not exported."""
+    if scenario.control.python is not None:
+        raise InputError("controllers of your own are in Python: not exported", "$.control.python")
+    integral = scenario.design.method == "integral" or scenario.design.K_q is not None
+    if integral and scenario.cooling is None:
         raise InputError("the protocol with integrals is not exported", "$.design.method")
-    if scenario.design.protocol == "printed":
-        raise InputError(
-            "the protocol as printed is unstable, and is not exported; leave it at 'corrected'",
-            "$.design.protocol",
-        )
     if (periods(scenario)[: scenario.network.N] > 1).any():
         raise InputError(
             "all controllers that are exported have the period of the scenario; export those of "
@@ -157,43 +176,95 @@ def _targets(names: tuple[str, ...]) -> tuple[Platform, ...]:
     return tuple(PLATFORMS[name] for name in dict.fromkeys(names)) or (host(),)
 
 
-def _delay(scenario: Scenario, designed: Design) -> dict[str, Any]:
-    """Whether the certificate covers the period that every message takes in another master."""
+def _fmus(
+    scenario: Scenario,
+    made: Controllers,
+    folder: Path,
+    targets: tuple[Platform, ...],
+) -> tuple[list[Path], str, str]:
+    """Write FMUs, values and SSP file: what is written, and why one or the other is not."""
+    system, fmus = folder / f"{scenario.name}.ssp", [folder / name for name in _FMUS]
+    for path in (*fmus, system):  # of another time
+        path.unlink(missing_ok=True)
+    try:
+        model = controller_model(made)
+    except InputError as error:
+        return [], error.message, error.message
+    write(fmus[0], archive(model, 2, targets))
+    write(fmus[1], archive(model, 3, targets))
+    try:
+        write(system, ssp(structure_of(scenario, made, fmus[0])))
+    except InputError as error:
+        return fmus, "", str(error)
+    return [*fmus, system], "", ""
+
+
+def _agents(
+    scenario: Scenario,
+    made: Controllers,
+    instances: Instances,
+    names: tuple[str, ...],
+    with_values: bool,
+) -> dict[str, Any]:
+    """Return agents.json; values are those of the FMUs."""
+    agent, rows = scenario.agent, []
+    for i, (name, links) in enumerate(zip(names, made.links, strict=True)):
+        spec = instances.specs[i]
+        ports = {**_ports("u", agent.p, spec.inputs), **_ports("y", agent.q, spec.readings)}
+        row: dict[str, Any] = {
+            "name": name,
+            "hears": [names[sender] for sender in links.senders],
+            "hears_leader": links.leader != 0,
+            "ports": ports,
+        }
+        if with_values:
+            row["values"] = {key: value.tolist() for key, value in values(made, i).items()}
+        rows.append(row)
+    measured = {name: scenario.plant.measured[name] for name in extras(scenario)}
+    return {"period": made.h, "measured": measured, "agents": rows}
+
+
+def _ports(letter: str, count: int, ports: PortMap) -> dict[str, dict[str, Any]]:
+    return {
+        f"{letter}{k + 1}": {
+            "variable": ports.variables[k],
+            "scale": ports.scale[k],
+            "offset": ports.offset[k],
+        }
+        for k in range(count)
+    }
+
+
+def _delay(scenario: Scenario, designed: Design, certified: str) -> dict[str, Any]:
+    """Whether the certificate covers that messages take one period."""
+    if certified == "no":
+        return {"what": "delay of messages", "covered": False, "why": "nothing is proved"}
     channel = attrs.evolve(scenario.channel, delay=scenario.clock.h)
     rows = coverage(attrs.evolve(scenario, channel=channel), designed)
     return next(row for row in rows if row["what"] == "delay of messages")
 
 
-def _agents(controllers: Controllers, names: tuple[str, ...]) -> dict[str, Any]:
-    rows = []
-    for i, (name, links) in enumerate(zip(names, controllers.links, strict=True)):
-        given = {**controllers.parameters(i), **controllers.first(i)}
-        rows.append(
-            {
-                "name": name,
-                "hears": [names[sender] for sender in links.senders],
-                "hears_leader": links.leader != 0,
-                "values": {key: value.tolist() for key, value in given.items()},
-            }
-        )
-    return {"period": controllers.h, "agents": rows}
+def _readme(scenario: Scenario, of: Controllers, made: Exported) -> str:
+    def template(name: str) -> str:
+        return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
-
-def _readme(scenario: Scenario, controllers: Controllers, made: Exported) -> str:
     agent = scenario.agent
-    system = f"`{scenario.name}.ssp`: plants, controllers and leader, connected (SSP 1.0, FMI 2)."
-    if made.no_ssp:
-        system = f"There is no SSP file: {made.no_ssp}."
-    text = Path(__file__).with_name("export_readme.md").read_text(encoding="utf-8")
-    return text.format(
+    fmus = f"There are no FMUs: {made.no_fmu}.\n"
+    if not made.no_fmu:
+        system = f"`{scenario.name}.ssp`: plants, controllers and leader, connected (FMI 2)."
+        if made.no_ssp:
+            system = f"There is no SSP file: {made.no_ssp}."
+        fmus = template("export_fmus.md").format(system=system)
+    return template("export_readme.md").format(
         name=scenario.name,
-        period=f"{controllers.h:g}",
-        agents=len(controllers.links),
+        period=f"{of.h:g}",
+        agents=len(of.links),
         p=agent.p,
         q=agent.q,
         m=agent.m,
-        certified=made.design.certificate.certified,
-        system=system,
+        certified=made.certified,
+        measured=", ".join(["y", *extras(scenario)]),
         covers="covers" if made.delay["covered"] else "does NOT cover",
         why=made.delay["why"],
+        fmus=fmus,
     )

@@ -162,13 +162,7 @@ def _run_in(
     if beginning.branch:
         told["branch"] = beginning.branch
         scenario = attrs.evolve(scenario, baseline=False)  # it would begin at the start
-    facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
-    if scenario.control.python is not None:
-        facts |= not_about(f"controllers of one's own, {scenario.control.python!r}.")
-    elif scenario.cooling is not None:
-        from posmas_fmi.scenario.cooling import proved
-
-        facts |= proved(scenario.control, designed)
+    facts = facts_of(scenario, designed)
 
     def started(plant: FmuPlant) -> None:
         """All FMUs run: only now is what an earlier run left in the folder given up."""
@@ -215,6 +209,18 @@ def _run_in(
     elif report:
         write_report(folder)
     return RunResult(folder, designed, summary, facts["certified"])
+
+
+def facts_of(scenario: Scenario, designed: Design) -> dict[str, Any]:
+    """Return what design.json holds: gains, and the certificate of the law that has them."""
+    facts = {**designed.to_dict(), "sector": list(scenario.agent.sector)}
+    if scenario.control.python is not None:
+        facts |= not_about(f"controllers of one's own, {scenario.control.python!r}.")
+    elif scenario.cooling is not None:
+        from posmas_fmi.scenario.cooling import proved
+
+        facts |= proved(scenario.control, designed)
+    return facts
 
 
 def _simulate(

@@ -12,7 +12,14 @@ import numpy as np
 
 from posmas_fmi.cosim.fmu_plant import PlantSpec
 from posmas_fmi.errors import InputError
-from posmas_fmi.export import Component, Connection, Connector, Controllers, Structure
+from posmas_fmi.export import (
+    Component,
+    Connection,
+    Connector,
+    Controllers,
+    Structure,
+    values,
+)
 from posmas_fmi.expression import VectorFunction
 from posmas_fmi.fmu.about import About, read_about
 from posmas_fmi.fmu.build import agent_fmu
@@ -113,8 +120,9 @@ class _Structure:
                 factor, offset = 1 / of.scale[j], -of.offset[j] / of.scale[j]
                 start = (plant, self._output(spec, of.variables[j]))
                 self._connect(start, (law, f"y[{j + 1}]"), factor, offset)
+            sent = values(controllers, i)["heard"].shape[1]
             for k, sender in enumerate(links.senders):
-                for j in range(controllers.sent):
+                for j in range(sent):
                     end = (law, f"heard[{k + 1},{j + 1}]")
                     self._connect((self._laws[sender], f"sent[{j + 1}]"), end)
             for j in range(agent.m if links.leader else 0):
@@ -174,44 +182,43 @@ class _Structure:
 
     # ---- components -----------------------------------------------------------------------------
 
-    def _component(self, name: str, fmu: Path, values: Mapping[str, Any]) -> Component:
-        return Component(name, fmu, tuple(self._connectors.get(name, {}).values()), values)
+    def _component(self, name: str, fmu: Path, given: Mapping[str, Any]) -> Component:
+        return Component(name, fmu, tuple(self._connectors.get(name, {}).values()), given)
 
     def _plant(self, i: int) -> Component:
         spec = self._instances.specs[i]
-        values = spread(self._abouts[spec.fmu], spec.values)
-        for name, value in values.items():
+        given = spread(self._abouts[spec.fmu], spec.values)
+        for name, value in given.items():
             if isinstance(value, str) or np.ndim(value):
                 raise InputError(
                     f"{spec.fmu.name}: the value of {name!r} is no single number, and only those "
                     "are written to an SSP file"
                 )
         return self._component(
-            self._plants[i], spec.fmu, {name: float(value) for name, value in values.items()}
+            self._plants[i], spec.fmu, {name: float(value) for name, value in given.items()}
         )
 
     def _law(self, i: int, controller: Path) -> Component:
-        made = self._controllers
-        values = dict(_elements({**made.parameters(i), **made.first(i)}))
-        return self._component(self._laws[i], controller, values)
+        given = dict(_elements(values(self._controllers, i)))
+        return self._component(self._laws[i], controller, given)
 
     def _leader(self) -> Component:
         agent = self._scenario.agent
         assert isinstance(agent.g, VectorFunction)
         assert isinstance(agent.sec, VectorFunction)
         path = agent_fmu(agent.g, agent.sec, agent.m, agent.p, agent.m, fmi=2)
-        values = {
+        given = {
             "A": agent.A,
             "H": agent.H,
             "B": np.zeros_like(agent.B),
             "C": np.eye(agent.m),
             "x": self._controllers.s0,
         }
-        return self._component(self._lead, path, dict(_elements(values)))
+        return self._component(self._lead, path, dict(_elements(given)))
 
 
-def _elements(values: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    for name, value in values.items():
+def _elements(given: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    for name, value in given.items():
         array = np.asarray(value, dtype=float)
         for index in np.ndindex(array.shape):
             label = ",".join(str(k + 1) for k in index)

@@ -1,58 +1,45 @@
-/* The controller of one agent as it is shipped: what it measures and hears goes in, its input and what
- * it tells its neighbours come out. Nothing but doubles, pure functions, no library but math.h.
+/* The controller of one agent as it is shipped: what the engine of the simulation does for an agent at
+ * a communication point. Pure functions of doubles, no library but math.h. At each point t,
  *
- *     agent_begin    once, with what is known at the start
- *     agent_show     u, to be held over the period that begins now, and what is sent
- *     agent_act      over that period, with what was measured and heard at its beginning
+ *     agent_send     what the agent tells those that hear it
+ *     ...            the bus: messages come in, the last one of each neighbour stays
+ *     agent_act      its input, to be held from t to t + CONTROLLER.h
  *
- * and so on with agent_show. What is heard at a communication point acts on u from the next one on:
- * every message takes one period. So no output depends on an input at the same time, and any master
- * or bus that passes values on once in a period gives the same result. */
+ * and `agent_lead_send`, `agent_lead` for the leader, wherever that runs. What is measured and heard
+ * should be of t. Messages that are a period old, or lost now and then, are a matter for the
+ * certificate: see README.md. */
 #ifndef AGENT_H
 #define AGENT_H
 
 #include "controller.h"
-#include "controller_data.h" /* HEARD, DISTRIBUTED and CONTROLLER, generated */
+#include "controller_data.h" /* HEARD and CONTROLLER, generated */
 
-enum { SENT = M + (DISTRIBUTED ? Q : 0) };
-
-/* In which agents differ: the weights of (6), phi included, and of (22). */
+/* In which agents differ: the weights of their disagreement with what they hear. */
 typedef struct {
-    double own;                             /* of the agent's own estimate: 0 is no agent */
-    double leader;                          /* 0: does not hear the leader */
-    double weight[HEARD];                   /* of each neighbour's estimate; 0: there is none */
-#if DISTRIBUTED
-    double own_innovation;
+    double own;                      /* of what the agent itself sends */
+    double leader;                   /* of what the leader sends; 0: it is not heard */
+    double weight[HEARD];            /* of what each neighbour sends; 0: there is none */
+    double own_innovation;           /* the same for the last INNOVATION values of a message */
     double innovation_weight[HEARD];
-#endif
 } AgentLinks;
 
+/* What an agent is told; measured as controller.h has it, silence is how long ago [s] the oldest of
+ * the last messages of neighbours was sent, and that of the leader. */
 typedef struct {
-    double y[Q];                            /* measured */
-    double heard[HEARD][SENT];              /* last message of each neighbour */
-    double s[M];                            /* last message of the leader: its state */
+    double measured[MEASURED];
+    double heard[HEARD][MESSAGE];
+    double leader[MESSAGE];
+    double silence[2];
 } AgentInputs;
 
-typedef struct {
-    double xhat[M];                         /* the estimate */
-    double disagreement[M];                 /* from which u follows */
-#if DISTRIBUTED
-    double innovation[Q];                   /* y - C xhat at the last communication point */
-#endif
-} AgentState;
+/* own: OWN values of the agent, or NULL where OWN is 0. */
+void agent_send(const double *own, const AgentInputs *in, const double *memory, double *message);
 
-typedef struct {
-    double u[P];
-    double sent[SENT];                      /* xhat, and the innovation where it is distributed */
-    double sec_u[P];                        /* what the observer takes u for */
-} AgentOutputs;
+/* u (P), and the memory (MEMORY) a period later in place of that of now. */
+void agent_act(const AgentLinks *links, const double *own, double t, const AgentInputs *in,
+               double *memory, double *u);
 
-/* NULL, or why it cannot begin. */
-const char *agent_begin(const AgentLinks *links, const AgentInputs *in, AgentState *state);
-void agent_act(const AgentLinks *links, const AgentInputs *in, double t, AgentState *state);
-void agent_show(const AgentState *state, AgentOutputs *out);
-
-/* The leader: its state over one period. */
-void agent_lead(double t, double *s);
+void agent_lead_send(const double *memory, double *message);
+void agent_lead(double t, double *memory);
 
 #endif
