@@ -572,7 +572,10 @@ def test_the_command_prints_what_it_wrote(
     assert "certified  yes" in said
     assert "that covers messages that take one period" in said
     assert main([*arguments, "--platform", "amiga"]) == 2
-    assert "--platform: expected one of" in capsys.readouterr().err
+    assert "--platform: expected platforms from x86_64-linux" in capsys.readouterr().err
+    twice = ["--platform", "aarch64-darwin", "--platform", "x86_64-darwin"]
+    assert main([*arguments, *twice]) == 2
+    assert "--platform: FMI 2 has one folder only" in capsys.readouterr().err
 
 
 def test_an_agent_that_hears_nobody_but_the_leader(tmp_path: Path) -> None:

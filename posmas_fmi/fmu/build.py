@@ -78,7 +78,7 @@ def fmu(
     cache: Path | None = None,
 ) -> Path:
     """Return the .fmu of a model: prebuilt, cached, or built now; parameters as `agent_fmu`."""
-    version, wanted = _version(fmi), _platforms(platforms, fmi)
+    version, wanted = _version(fmi), platforms_for(platforms, fmi)
     name = file_name(model, version, wanted)
     folder = cache if cache is not None else cache_folder()
     for place in (resources.prebuilt() / name, folder / name):
@@ -238,11 +238,31 @@ def build_plants(
     for name in names or plants:
         model = read_plant(plants[name])
         for fmi in (2, 3):
-            targets = _platforms(buildable(fmi) if platforms is None else platforms, fmi)
+            targets = platforms_for(buildable(fmi) if platforms is None else platforms, fmi)
             path = out_dir / f"{name}-fmi{fmi}.fmu"
             write(path, archive(model, _version(fmi), targets))
             paths.append(path)
     return paths
+
+
+def platforms_for(names: Sequence[str] | None, fmi: int) -> tuple[Platform, ...]:
+    """Return the platforms of these names, the host by default, that one FMU can have binaries for.
+
+    Raises
+    ------
+    BuildError
+        If there is no such platform, or two have the same folder in this version of FMI.
+    """
+    if names is None:
+        return (host(),)
+    unknown = sorted(set(names) - set(PLATFORMS))
+    if unknown or not names:
+        raise BuildError(f"expected platforms from {', '.join(PLATFORMS)} (got {list(names)})")
+    chosen = tuple(PLATFORMS[name] for name in PLATFORMS if name in names)
+    folders = [p.folder(fmi) for p in chosen]
+    if len(set(folders)) < len(folders):
+        raise BuildError(f"FMI {fmi} has one folder only for two of {', '.join(names)}; take one")
+    return chosen
 
 
 # ---- details ------------------------------------------------------------------------------------
@@ -254,19 +274,6 @@ def _version(fmi: int) -> FmiVersion:
     if fmi == 3:
         return 3
     raise BuildError(f"expected FMI version 2 or 3 (got {fmi!r})")
-
-
-def _platforms(names: Sequence[str] | None, fmi: int) -> tuple[Platform, ...]:
-    if names is None:
-        return (host(),)
-    unknown = sorted(set(names) - set(PLATFORMS))
-    if unknown or not names:
-        raise BuildError(f"expected platforms from {', '.join(PLATFORMS)} (got {list(names)})")
-    chosen = tuple(PLATFORMS[name] for name in PLATFORMS if name in names)
-    folders = [p.folder(fmi) for p in chosen]
-    if len(set(folders)) < len(folders):
-        raise BuildError(f"FMI {fmi} has one folder only for two of {', '.join(names)}; take one")
-    return chosen
 
 
 def _zip(content: Mapping[str, bytes]) -> bytes:

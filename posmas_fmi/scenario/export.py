@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import attrs
 from posmas_fmi.cosim.fmus import PortMap
 from posmas_fmi.cosim.law import CompiledLaw, ProtocolLaw
 from posmas_fmi.design import Design
-from posmas_fmi.errors import InputError
+from posmas_fmi.errors import BuildError, InputError
 from posmas_fmi.export import Controllers, c_files, controller_model, ssp, values
-from posmas_fmi.fmu.build import archive, write
-from posmas_fmi.fmu.compile import PLATFORMS, Platform, host
+from posmas_fmi.fmu.build import archive, platforms_for, write
+from posmas_fmi.fmu.compile import Platform
+from posmas_fmi.fmu.sources import FmiVersion
 from posmas_fmi.scenario.build import Scenario
 from posmas_fmi.scenario.compare import controllers
 from posmas_fmi.scenario.coverage import coverage
@@ -30,7 +32,7 @@ from posmas_fmi.scenario.plant import Instances, fmu_files, make_instances, peri
 from posmas_fmi.scenario.structure import structure_of
 from posmas_fmi.writing import whole
 
-_FMUS = ("controller-fmi2.fmu", "controller-fmi3.fmu")
+_FMUS: dict[FmiVersion, str] = {2: "controller-fmi2.fmu", 3: "controller-fmi3.fmu"}
 
 
 @attrs.frozen
@@ -105,7 +107,7 @@ def export(
     """
     scenario = _one(scenario, controller)
     _refuse(scenario)
-    targets = _targets(platforms)
+    targets = {fmi: _targets(platforms, fmi) for fmi in _FMUS}
     instances = make_instances(scenario, fmu_files(scenario), extras(scenario))
     designed = make_design_of(scenario)
     law = make_law(scenario, designed)
@@ -168,35 +170,34 @@ def _refuse(scenario: Scenario) -> None:
         )
 
 
-def _targets(names: tuple[str, ...]) -> tuple[Platform, ...]:
-    for name in names:
-        if name not in PLATFORMS:
-            known = ", ".join(PLATFORMS)
-            raise InputError(f"expected one of {known} (got {name!r})", "--platform")
-    return tuple(PLATFORMS[name] for name in dict.fromkeys(names)) or (host(),)
+def _targets(names: tuple[str, ...], fmi: FmiVersion) -> tuple[Platform, ...]:
+    try:
+        return platforms_for(names or None, fmi)
+    except BuildError as error:
+        raise InputError(error.message, "--platform") from None
 
 
 def _fmus(
     scenario: Scenario,
     made: Controllers,
     folder: Path,
-    targets: tuple[Platform, ...],
+    targets: Mapping[FmiVersion, tuple[Platform, ...]],
 ) -> tuple[list[Path], str, str]:
     """Write FMUs, values and SSP file: what is written, and why one or the other is not."""
-    system, fmus = folder / f"{scenario.name}.ssp", [folder / name for name in _FMUS]
-    for path in (*fmus, system):  # of another time
+    system, fmus = folder / f"{scenario.name}.ssp", {v: folder / n for v, n in _FMUS.items()}
+    for path in (*fmus.values(), system):  # of another time
         path.unlink(missing_ok=True)
     try:
         model = controller_model(made)
     except InputError as error:
         return [], error.message, error.message
-    write(fmus[0], archive(model, 2, targets))
-    write(fmus[1], archive(model, 3, targets))
+    for fmi, path in fmus.items():
+        write(path, archive(model, fmi, targets[fmi]))
     try:
-        write(system, ssp(structure_of(scenario, made, fmus[0])))
+        write(system, ssp(structure_of(scenario, made, fmus[2])))
     except InputError as error:
-        return fmus, "", str(error)
-    return [*fmus, system], "", ""
+        return [*fmus.values()], "", str(error)
+    return [*fmus.values(), system], "", ""
 
 
 def _agents(
