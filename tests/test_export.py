@@ -316,6 +316,15 @@ def test_the_preflight_of_an_exported_controller(made: Made) -> None:
     )
 
 
+def test_the_preflight_tells_what_an_fmu_says(local: Made) -> None:
+    found = check_fmu(local.folder / "controller-fmi3.fmu", control=False)
+    (fatal,) = [one for one in found.findings if one.severity == "fatal"]
+    assert fatal.place == "fmi3ExitInitializationMode"
+    assert (
+        'it returned status 3 (Error); it said "it cannot start: its parameter own' in fatal.message
+    )
+
+
 def test_what_the_readme_says_of_the_proof(local: Made, tmp_path: Path) -> None:
     text = (local.folder / "README.md").read_text()
     assert "Certified: yes" in text

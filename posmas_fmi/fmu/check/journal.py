@@ -23,6 +23,7 @@ _NO_STATUS = ("dlopen", "dlclose", "GetVersion", "GetTypesPlatform")
 _CODES = ("", "warning", "discard", "error", "fatal", "pending")
 _UNLIKELY = 0x5EED_0000  # added to what instances give back, which may be 1 by mistake
 _LARGE = 64 * 1024  # bytes of one message
+_QUOTED = 200  # characters of what an FMU said
 _MOST_MESSAGES = 20_000  # in one call …
 _MOST_BYTES = 64 * 2**20  # … and together, before the trial ends
 _CONVERSION = re.compile(
@@ -44,6 +45,8 @@ class Journal:
         Duration of the last call [s].
     discarded : bool
         Whether a step of FMI 2 returned Discard, which has not been judged.
+    said : str
+        The last message during the present call.
     """
 
     def __init__(self, board: Board, surroundings: Surroundings) -> None:
@@ -53,6 +56,7 @@ class Journal:
         self._failed = self._judged = False
         self.discarded = False
         self.messages, self.bytes = 0, 0
+        self.said = ""
 
     @property
     def severity(self) -> Severity:
@@ -91,6 +95,7 @@ class Journal:
     def call(self, name: str) -> Callable[[Any], None]:
         """Note the begin of a call; what is returned notes its end."""
         self.messages = self.bytes = 0
+        self.said = ""
         self.board.begin(name)
         began = time.perf_counter()
 
@@ -119,7 +124,8 @@ class Journal:
             self.severity,
             code,
             name,
-            f"it returned status {result} ({status_label(result)})",
+            f"it returned status {result} ({status_label(result)})"
+            + (f'; it said "{self.said}"' if self.said else ""),
             "give start values and inputs that suit it with --set" if self.board.vital else "",
         )
 
@@ -186,6 +192,7 @@ class TrialMessages:
             )
             os.kill(os.getpid(), signal.SIGKILL)
         self._kept.append((text or b"")[:500].decode("utf-8", "replace"))
+        journal.said = " ".join(self._kept[-1][:_QUOTED].split())
 
     def _abuses(
         self,
