@@ -28,6 +28,7 @@ from posmas_fmi.cosim import engine
 from posmas_fmi.cosim.law import ProtocolLaw
 from posmas_fmi.errors import BuildError, FmuError, InputError
 from posmas_fmi.export import Component, Connection, Connector, Controllers, Structure, ssp
+from posmas_fmi.fmu import compile as compiling
 from posmas_fmi.fmu.build import agent_fmu
 from posmas_fmi.fmu.check.preflight import check_fmu
 from posmas_fmi.fmu.compile import find_compiler, host
@@ -320,9 +321,8 @@ def test_the_preflight_tells_what_an_fmu_says(local: Made) -> None:
     found = check_fmu(local.folder / "controller-fmi3.fmu", control=False)
     (fatal,) = [one for one in found.findings if one.severity == "fatal"]
     assert fatal.place == "fmi3ExitInitializationMode"
-    assert (
-        'it returned status 3 (Error); it said "it cannot start: its parameter own' in fatal.message
-    )
+    said = 'it returned status 3 (Error); it said "it cannot start: its parameter own is 0'
+    assert said in fatal.message
 
 
 def test_what_the_readme_says_of_the_proof(local: Made, tmp_path: Path) -> None:
@@ -547,6 +547,20 @@ def test_without_an_ssp_file_the_rest_is_there(
     assert not (folder / "paper-example-1-tanh.ssp").exists()  # not that of another time
     assert (folder / "controller-fmi3.fmu").exists()
     assert "There is no SSP file: shared" in (folder / "README.md").read_text()
+
+
+def test_without_a_compiler_there_is_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(compiling.shutil, "which", lambda *_: None)
+    monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda *_: None)
+    arguments = ["export", str(written(tmp_path, TANH)), "--out", str(tmp_path / "export")]
+    assert main([*arguments, "--platform", "x86_64-windows"]) == 3
+    assert "found no C compiler for x86_64-windows" in capsys.readouterr().err
+    assert not (tmp_path / "export").exists()
+    assert main(arguments) == 0
+    assert "no FMUs and no SSP file: found no C compiler" in capsys.readouterr().out
+    assert (tmp_path / "export" / "c" / "agents.h").exists()
 
 
 def test_elements_of_arrays_and_states_have_no_place_in_ssp(tmp_path: Path) -> None:

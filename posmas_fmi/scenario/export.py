@@ -103,7 +103,7 @@ def export(
     InputError
         If the controllers cannot be had in C, or agents have different periods.
     PosmasError
-        If there is no design, or no compiler.
+        If there is no design, or no compiler for a platform that was asked for.
     """
     scenario = _one(scenario, controller)
     _refuse(scenario)
@@ -123,12 +123,13 @@ def export(
     senders = network.adjacency.indices
     program = Controllers(law, senders, scenario.clock.h, scenario.xhat0, scenario.s0)
     facts = facts_of(scenario, designed)
+    fmus, no_fmu = _built(program, targets, bool(platforms))
     with occupied(folder):
         (folder / "c").mkdir(exist_ok=True)
         for name, text in c_files(program, names).items():
             with whole(folder / "c" / name) as file:
                 file.write(text)
-        more, no_fmu, no_ssp = _fmus(scenario, program, folder, targets)
+        more, no_ssp = _write_fmus(scenario, program, folder, fmus, no_fmu)
         agents = _agents(scenario, program, instances, names, bool(more))
         write_json(folder / "agents.json", agents)
         write_json(folder / "design.json", facts)
@@ -177,27 +178,38 @@ def _targets(names: tuple[str, ...], fmi: FmiVersion) -> tuple[Platform, ...]:
         raise InputError(error.message, "--platform") from None
 
 
-def _fmus(
-    scenario: Scenario,
-    made: Controllers,
-    folder: Path,
-    targets: Mapping[FmiVersion, tuple[Platform, ...]],
-) -> tuple[list[Path], str, str]:
-    """Write FMUs, values and SSP file: what is written, and why one or the other is not."""
-    system, fmus = folder / f"{scenario.name}.ssp", {v: folder / n for v, n in _FMUS.items()}
-    for path in (*fmus.values(), system):  # of another time
+def _built(
+    program: Controllers, targets: Mapping[FmiVersion, tuple[Platform, ...]], must: bool
+) -> tuple[dict[str, bytes], str]:
+    """Return the FMUs by name, or why there are none; without a compiler, an error if they must."""
+    try:
+        model = controller_model(program)
+        return {name: archive(model, fmi, targets[fmi]) for fmi, name in _FMUS.items()}, ""
+    except InputError as error:
+        return {}, error.message
+    except BuildError as error:
+        if must:
+            raise
+        return {}, error.message
+
+
+def _write_fmus(
+    scenario: Scenario, program: Controllers, folder: Path, fmus: Mapping[str, bytes], why: str
+) -> tuple[list[Path], str]:
+    """Write FMUs and SSP file in place of those of another time; why there is no SSP file."""
+    system = folder / f"{scenario.name}.ssp"
+    for path in (*(folder / name for name in _FMUS.values()), system):
         path.unlink(missing_ok=True)
+    if not fmus:
+        return [], why
+    paths = [folder / name for name in fmus]
+    for path, data in zip(paths, fmus.values(), strict=True):
+        write(path, data)
     try:
-        model = controller_model(made)
+        write(system, ssp(structure_of(scenario, program, paths[0])))
     except InputError as error:
-        return [], error.message, error.message
-    for fmi, path in fmus.items():
-        write(path, archive(model, fmi, targets[fmi]))
-    try:
-        write(system, ssp(structure_of(scenario, made, fmus[2])))
-    except InputError as error:
-        return [*fmus.values()], "", str(error)
-    return [*fmus.values(), system], "", ""
+        return paths, str(error)
+    return [*paths, system], ""
 
 
 def _agents(
